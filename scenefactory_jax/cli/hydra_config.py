@@ -155,7 +155,7 @@ def _explain(name: str, error: Exception) -> str:
     text = " ".join(text.split())
     if "provider=hydra.searchpath" not in text:  # without folders of the user, the search path is of no use
         text = text.partition(" Config search path:")[0]
-    if missing := re.search(r"Could not (?:load|find) '([^']+)/([^/']+)'", text):
+    if missing := re.search(r"Could not load '(.+)/([^/']+)'", text):
         group, option = missing.groups()
         valid = ", ".join(sorted(path.stem for path in (find_conf() / group).glob("*.yaml")))
         return f"{group}: unknown option {option!r}; valid: {valid}"

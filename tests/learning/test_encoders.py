@@ -204,7 +204,7 @@ def test_mistakes_are_named():
     def init(name, observation, groups=None, **changes):
         return encoding.make_encoder(name, groups=groups, **changes)().init(jax.random.key(0), observation)
 
-    with pytest.raises(ConfigError, match=r"policy/encoder: unknown option 'perceiver'; valid: .*late_fusion, lq, lqh, mlp, mtr, none, way"):
+    with pytest.raises(ConfigError, match=r"Could not find 'policy/encoder/perceiver' Available options .*: base late_fusion lq lqh mlp"):
         configs.load_config("train", "policy=actor_critic", "policy/encoder=perceiver")
     with pytest.raises(ConfigError, match=r"policy\.encoder\._target_: 'perceiver' is not in .*; valid: late_fusion, lq, lqh, mlp, mtr, none, w"):
         heads.make_encoder({"_target_": "perceiver"}, observations={}, dtype="float32")
