@@ -114,13 +114,24 @@ def _rate(program: Callable, parameters: Any, observation: Observation, row: dic
     return {**found, "per_s": rate, "tflops": tflops, "share": None if numbers.peak_tflops is None else tflops / numbers.peak_tflops}
 
 
+COLUMNS = {  # of the table: key of a row, format
+    "Encoder": ("encoder", ""),
+    "Parameters": ("parameters", ","),
+    "Program": ("program", ""),
+    "Batch": ("batch", ","),
+    "MFLOP a sample": ("mflop_a_sample", ".2f"),
+    "Samples/s": ("per_s", ",.0f"),
+    "TFLOP/s": ("tflops", ".3g"),
+    "Share of peak": ("share", ".1%"),
+    "Scratch, MiB": ("scratch_mib", ",.0f"),
+    "Compile, s": ("compile_s", ".1f"),
+}
+
+
 def format_rows(rows: list[dict[str, Any]]) -> str:
-    """Rows as Markdown."""
-    header = ["Encoder", "Parameters", "Program", "Batch", "MFLOP a sample", "Samples/s", "TFLOP/s", "Share of peak", "Scratch, MiB", "Compile, s"]
-    show = lambda row, key, form: "-" if row.get(key) is None else format(row[key], form)  # noqa: E731
-    forms = {"parameters": ",", "program": "", "batch": ",", "mflop_a_sample": ".2f", "per_s": ",.0f", "tflops": ".3g", "share": ".1%"}
-    forms |= {"scratch_mib": ",.0f", "compile_s": ".1f"}
-    return markdown.format_table(header, [[row["encoder"], *(show(row, key, form) for key, form in forms.items())] for row in rows])
+    """Rows as Markdown; a dash for what is not known."""
+    cells = [["-" if row.get(key) is None else format(row[key], form) for key, form in COLUMNS.values()] for row in rows]
+    return markdown.format_table(list(COLUMNS), cells)
 
 
 def main(arguments: list[str] | None = None) -> list[dict[str, Any]]:

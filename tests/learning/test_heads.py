@@ -1,6 +1,7 @@
 """Heads on encoders: independent critics, plain arithmetic, shared and separate encoders, PPO with each encoder."""
 
 import functools
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -21,8 +22,16 @@ from scenefactory_jax.learning.training_loop import make_policy
 pytestmark = pytest.mark.usefixtures("quickly")
 
 HEAD = {"hidden": [7, 5], "activation": "relu"}
-POLICY = {"hidden": [7, 5], "activation": "tanh", "shared_encoder": False, "mean_init": [0.5, 0.0, -1.0], "log_std_init": -0.5,
-          "actor_head_scale": 0.01, "dtype": "float32", "observation_groups": {}}  # fmt: skip
+POLICY: dict[str, Any] = {
+    "hidden": [7, 5],
+    "activation": "tanh",
+    "shared_encoder": False,
+    "mean_init": [0.5, 0.0, -1.0],
+    "log_std_init": -0.5,
+    "actor_head_scale": 0.01,
+    "dtype": "float32",
+    "observation_groups": {},
+}
 OBSERVATION = observe(0)
 ACTION = jnp.asarray(np.random.default_rng(1).normal(size=(2, 3, 2)), jnp.float32)
 
@@ -85,7 +94,7 @@ def test_an_encoder_is_shared_only_on_demand(shared):
     mean, log_std, value = jax.jit(policy.apply)(drawn, OBSERVATION)
     assert mean.shape == (2, 3, 3) and value.shape == (2, 3)
     np.testing.assert_allclose(mean, np.broadcast_to([0.5, 0.0, -1.0], mean.shape), atol=0.05)
-    np.testing.assert_array_equal(log_std, np.float32([-0.5] * 3))
+    np.testing.assert_array_equal(log_std, np.full(3, -0.5, np.float32))
     derive = jax.jit(jax.grad(lambda p, part: jnp.sum(policy.apply(p, OBSERVATION)[part]), 0), static_argnums=1)
     touched = {part: {name for name, leaves in derive(encoding.shake(drawn), part)["params"].items() if np.any(jax.tree.leaves(leaves)[0])}
                for part in (0, 2)}  # fmt: skip
@@ -113,6 +122,7 @@ def with_neighbours(env):
     return env._replace(observe=observe)
 
 
+SLOW = ("late_fusion", "lqh", "wayformer")
 SHORT = {"lq": {"rounds": 1}, "wayformer": {"depth": 1}}
 
 
@@ -121,7 +131,7 @@ def made(worlds):
     return scenes(worlds)
 
 
-@pytest.mark.parametrize("name", ENTRIES)
+@pytest.mark.parametrize("name", [pytest.param(name, marks=pytest.mark.slow) if name in SLOW else name for name in ENTRIES])
 def test_ppo_trains_each_encoder(name):
     shared = name not in ("none", "mlp")  # compiles sooner
     policy = actor_critic.make(encoder={"_target_": name, **ENTRIES[name], **SHORT.get(name, {})}, **{**POLICY, "shared_encoder": shared})

@@ -1,7 +1,7 @@
 """Parts of encoders with attention: row embeddings, multi-head attention, feed-forward layers.
 
-Sums over rows, latents and parameters are float32; matrices multiply in `dtype`, except for the first layer of an embedding, whose inputs
-are metres and radians.
+Parameters and the sums of ReZero are float32; tokens are stored and matrices multiply in `dtype`, except for the first layer of an
+embedding: bfloat16 has 0.3 m for a place at 70 m.
 """
 
 import dataclasses
@@ -51,7 +51,8 @@ class Embedding(nn.Module):
     @nn.compact
     def __call__(self, x: Float[Array, "*batch F"]) -> Float[Array, "*batch D"]:
         for index, width in enumerate(self.widths):
-            x = dense(width, self.dtype if index else jnp.float32, name=f"layer_{index}")(x if index == 0 else jax.nn.relu(x))
+            x = jax.nn.relu(x.astype(self.dtype)) if index else x
+            x = dense(width, self.dtype if index else jnp.float32, name=f"layer_{index}")(x)
         return x
 
 
@@ -80,7 +81,7 @@ class Tokenizer(nn.Module):
                 if clock not in scalars:
                     scalars[clock] = self.param(f"{clock[0]}_times_{clock[1]}", normal, clock[1:])
                 x = x + scalars[clock][:, None]
-            tokens[name] = x.reshape(len(x), -1, x.shape[-1]), mask.reshape(len(x), -1)
+            tokens[name] = x.astype(self.dtype).reshape(len(x), -1, x.shape[-1]), mask.reshape(len(x), -1)
         return tokens
 
 

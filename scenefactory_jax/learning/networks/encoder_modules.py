@@ -162,7 +162,8 @@ class MotionTransformer(LatentEncoder):
             valid = ", ".join(blocks)
             raise ConfigError(f"policy.encoder.keys: the encoder mtr needs one of {', '.join(self.keys)}; the observation has {valid}")
         tokens = Tokenizer(self.numbers.embedding, self.dtype, pool_steps=True, name="tokens")(blocks)
-        x, mask = join_tokens(tokens)
+        joined, mask = join_tokens(tokens)
+        x = joined.astype(jnp.float32)
         keys, valid = join_tokens({name: tokens[name] for name in chosen})
         for index in range(self.layers):
             attention = self.attention(x.shape[-1], f"attention_{index}", query_bias=True)
