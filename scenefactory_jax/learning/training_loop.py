@@ -125,8 +125,9 @@ def _open_scenes(
 
 
 def make_policy(config: Mapping[str, Any]) -> Policy:
-    """Builds the policy of a config's `policy` entry; planners are given the run's `dynamics`, which they drive."""
-    context = {name: config[name] for name in ("dynamics",) if name in config}
+    """Builds the policy of a config's `policy` entry; planners are given the run's `dynamics`, encoders its `observations`."""
+    names = {"dynamics": "dynamics", "observations": "observation_groups"}  # planners have numbers that are called observations
+    context = {names[key]: config[key] for key in names if key in config}
     return instantiate(config["policy"], builtins=late_fusion, where="policy", **context)()
 
 

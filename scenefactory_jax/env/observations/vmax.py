@@ -5,12 +5,14 @@ road 1,655 numbers. Three differences of the data: points are those of the packe
 V-Max's limit of 2,200 or 3,000 points in the box does not exist.
 """
 
-from typing import Annotated, NamedTuple
+from collections.abc import Callable, Mapping
+from typing import Annotated, Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
+from scenefactory_jax.core import schema
 from scenefactory_jax.core.geometry import to_frame
 from scenefactory_jax.core.schema import Bounds, Count
 from scenefactory_jax.core.types import Scene, State
@@ -32,7 +34,25 @@ class Block(NamedTuple):
     mask: Bool[Array, "*a K S"]
 
 
+def divide_into_blocks(kind: str, *, rows: str) -> Callable[[Callable], Callable]:
+    """Declares how encoders divide the vector of a group: `function.divide(flat, numbers) -> blocks`, see `split_observation`.
+
+    Args:
+        rows: key of the group's entry with the number of its road rows.
+    """
+
+    def divide(flat: Float[Array, "*a F"], numbers: Mapping[str, Any]) -> dict[str, Block]:
+        return split_observation(flat, schema.read(numbers["view"], View), kind=kind, road_rows=numbers[rows])
+
+    def declare(function: Callable) -> Callable:
+        function.divide = divide  # pyright: ignore[reportFunctionMemberAccess]
+        return function
+
+    return declare
+
+
 @need_history(STEPS - 1)
+@divide_into_blocks("base", rows="road_points")
 def vmax_base(
     scene: Scene, state: State, *, view: View, road_points: Count, as_published: bool, start_row: Row, control_dt: float
 ) -> Float[Array, "A F"]:
@@ -50,6 +70,7 @@ def vmax_base(
 
 
 @need_history(STEPS - 1)
+@divide_into_blocks("lane", rows="road_points")
 def vmax_lane(
     scene: Scene, state: State, *, view: View, road_points: Count, as_published: bool, start_row: Row, control_dt: float
 ) -> Float[Array, "A F"]:
@@ -60,6 +81,7 @@ def vmax_lane(
 
 
 @need_history(STEPS - 1)
+@divide_into_blocks("road", rows="road_points")
 def vmax_road(
     scene: Scene, state: State, *, view: View, road_points: Count, as_published: bool, start_row: Row, control_dt: float
 ) -> Float[Array, "A F"]:
@@ -70,6 +92,7 @@ def vmax_road(
 
 
 @need_history(STEPS - 1)
+@divide_into_blocks("segment", rows="lanes")
 def vmax_segment(
     scene: Scene, state: State, *, view: View, lanes: Count, as_published: bool, start_row: Row, control_dt: float
 ) -> Float[Array, "A F"]:

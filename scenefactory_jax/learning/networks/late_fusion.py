@@ -26,9 +26,8 @@ from scenefactory_jax.core.pallas import on_gpu
 from scenefactory_jax.core.schema import ConfigError, Count
 from scenefactory_jax.core.types import Observation, Policy, SetObservation
 from scenefactory_jax.learning.networks import set_kernel
-
-# Increasing, and zero at zero: only so may rows be pooled before the activation, and an empty set be zeros on both sides of it
-ACTIVATIONS = {"elu": jax.nn.elu, "relu": jax.nn.relu, "tanh": jnp.tanh}
+from scenefactory_jax.learning.networks.heads import ACTIVATIONS
+from scenefactory_jax.learning.networks.observation_blocks import check_groups
 
 
 @dataclasses.dataclass(frozen=True)
@@ -86,14 +85,10 @@ def make(
     network = ActorCritic(architecture, tuple(map(float, mean_init)), float(log_std_init), float(actor_head_scale))
 
     def init(key: PRNGKeyArray, observation: Observation) -> Any:
-        trees = [name for name, group in observation.items() if not (isinstance(group, SetObservation) or hasattr(group, "shape"))]
-        if trees:
-            raise ConfigError(f"observations.{trees[0]}: expected a vector or a set, got a group for planners, which no network reads")
+        check_groups(observation)
         groups = sorted(name for name, group in observation.items() if isinstance(group, SetObservation))
         if unknown := sorted(set(named) - set(groups)):
             raise ConfigError(f"policy.rows.{unknown[0]}: the observation has no such set; valid: {', '.join(groups) or 'none'}")
-        if not observation:
-            raise ConfigError("policy: the observation has no group; add one to `observations`")
         return network.init(key, observation)
 
     return Policy(init, network.apply)  # pyright: ignore[reportArgumentType]
@@ -124,17 +119,23 @@ class Tower(nn.Module):
 
     @nn.compact
     def __call__(self, observation: Observation) -> Float[Array, "*batch outputs"]:
-        architecture, rows = self.architecture, dict(self.architecture.rows)
-        activate = ACTIVATIONS[architecture.activation]
-        vectors = [group for _, group in sorted(observation.items()) if not isinstance(group, SetObservation)]
-        fused = [activate(Layers(architecture, architecture.vector, name="vector")(jnp.concatenate(vectors, axis=-1)))] if vectors else []
-        for name, group in sorted(observation.items()):
-            if isinstance(group, SetObservation):
-                layers = Layers(architecture, rows.get(name, architecture.rows_default), name=f"{name}_rows")
-                fused.append(activate(layers(group.features, group.mask)))
-        x = activate(Layers(architecture, architecture.trunk, name="trunk")(jnp.concatenate(fused, axis=-1).astype(architecture.dtype)))
+        architecture = self.architecture
+        activate, fused = ACTIVATIONS[architecture.activation], fuse(architecture, observation)
+        x = activate(Layers(architecture, architecture.trunk, name="trunk")(fused.astype(architecture.dtype)))
         kernel, bias = nn.initializers.orthogonal(self.head_scale), lambda *_: jnp.array(self.head_bias, jnp.float32)
         return nn.Dense(len(self.head_bias), kernel_init=kernel, bias_init=bias, dtype=jnp.float32, name="head")(x)
+
+
+def fuse(architecture: Architecture, observation: Observation) -> Float[Array, "*batch W"]:
+    """Encodes all groups inside a compact module, and joins them: vectors first, then the sets in the order of their names."""
+    rows, activate = dict(architecture.rows), ACTIVATIONS[architecture.activation]
+    vectors = [group for _, group in sorted(observation.items()) if not isinstance(group, SetObservation)]
+    fused = [activate(Layers(architecture, architecture.vector, name="vector")(jnp.concatenate(vectors, axis=-1)))] if vectors else []
+    for name, group in sorted(observation.items()):
+        if isinstance(group, SetObservation):
+            layers = Layers(architecture, rows.get(name, architecture.rows_default), name=f"{name}_rows")
+            fused.append(activate(layers(group.features, group.mask)))
+    return jnp.concatenate(fused, axis=-1)
 
 
 class Layers(nn.Module):

@@ -1,0 +1,67 @@
+"""Policy of PPO on any encoder: heads of an actor and a critic, and a state-independent log standard deviation."""
+
+from typing import Any, Literal
+
+import flax.linen as nn
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from scenefactory_jax.core.schema import ConfigError, Count
+from scenefactory_jax.core.types import Observation, Policy
+from scenefactory_jax.learning.networks.heads import Encoder, Head, lecun_uniform, make_encoder
+
+
+def make(
+    *,
+    encoder: dict[str, Any],
+    hidden: list[Count],
+    activation: Literal["elu", "relu", "tanh"],
+    shared_encoder: bool,
+    mean_init: list[float],
+    log_std_init: float,
+    actor_head_scale: float,
+    dtype: Literal["float32", "bfloat16"],
+    observation_groups: dict[str, Any],
+) -> Policy:
+    """Builds the policy.
+
+    Args:
+        encoder: entry of `encoders`.
+        hidden: widths of the layers of each head, with activations between them.
+        shared_encoder: actor and critic read one encoder, which both losses train; False: each has its own.
+        mean_init, log_std_init, actor_head_scale: as of `late_fusion.make`.
+        dtype: of products; the first layers of encoders, the last ones of heads, sums, parameters, means and values are float32.
+        observation_groups: the config's `observations`.
+
+    Raises:
+        ConfigError: a number that does not fit; at `init`, an observation that the encoder cannot read.
+    """
+    if len(mean_init) != 3:
+        raise ConfigError(f"policy.mean_init: expected 3 numbers, throttle, steer and brake, got {mean_init}")
+    bound = make_encoder(encoder, observations=observation_groups, dtype=dtype)
+    numbers = tuple(map(float, mean_init)), float(log_std_init), float(actor_head_scale)
+    network = ActorCritic(bound, tuple(hidden), activation, shared_encoder, *numbers, dtype)
+    return Policy(network.init, network.apply)  # pyright: ignore[reportArgumentType]
+
+
+class ActorCritic(nn.Module):
+    """Heads and encoders: observation -> (mean, log_std, value)."""
+
+    encoder: Encoder
+    hidden: tuple[int, ...]
+    activation: str
+    shared_encoder: bool
+    mean_init: tuple[float, ...]
+    log_std_init: float
+    actor_head_scale: float
+    dtype: str
+
+    @nn.compact
+    def __call__(self, observation: Observation) -> tuple[Float[Array, "*batch 3"], Float[Array, " 3"], Float[Array, "*batch"]]:
+        actor = self.encoder(name="encoder" if self.shared_encoder else "actor_encoder")(observation)
+        critic = actor if self.shared_encoder else self.encoder(name="critic_encoder")(observation)
+        first = nn.initializers.orthogonal(self.actor_head_scale), lambda *_: jnp.array(self.mean_init, jnp.float32)
+        mean = Head(self.hidden, len(self.mean_init), self.activation, self.dtype, *first, name="actor_head")(actor)
+        value = Head(self.hidden, 1, self.activation, self.dtype, lecun_uniform, name="critic_head")(critic)
+        log_std = self.param("log_std", nn.initializers.constant(self.log_std_init), (len(self.mean_init),), jnp.float32)
+        return mean, log_std, value[..., 0]

@@ -1,0 +1,152 @@
+"""Parts of encoders with attention: row embeddings, multi-head attention, feed-forward layers.
+
+Parameters and the sums of ReZero are float32; tokens are stored and matrices multiply in `dtype`, except for the first layer of an
+embedding: bfloat16 has 0.3 m for a place at 70 m.
+"""
+
+import dataclasses
+from typing import Any, Literal
+
+import flax.linen as nn
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+from scenefactory_jax.core.schema import ConfigError, Count
+from scenefactory_jax.learning.networks.heads import lecun_uniform
+from scenefactory_jax.learning.networks.late_fusion import pool
+from scenefactory_jax.learning.networks.observation_blocks import Blocks
+
+Tokens = tuple[Array, Array]  # [B, T, D] and their mask [B, T]
+ROAD_USERS = ("ego", "others")  # blocks whose time steps are the same
+normal = nn.initializers.normal(0.01)  # flax's own default
+
+
+@dataclasses.dataclass(frozen=True)
+class Transformer:
+    """Numbers of an encoder with attention."""
+
+    embedding: tuple[Count, ...]  # widths of the layers that make a token of each row; the last one is the token's
+    heads: Count
+    head_features: Count
+    feed_forward: Count  # hidden width of a feed-forward part, in widths of its input
+    implementation: Literal["xla", "cudnn"]  # of jax.nn.dot_product_attention
+
+    def __post_init__(self) -> None:
+        if not self.embedding:
+            raise ConfigError("embedding: expected one width or more, got []")
+
+
+def dense(width: int, dtype: Any, *, use_bias: bool = True, name: str | None = None) -> nn.Dense:
+    """A dense layer with LeCun's uniform initialisation."""
+    return nn.Dense(width, use_bias=use_bias, kernel_init=lecun_uniform, dtype=dtype, name=name)
+
+
+class Embedding(nn.Module):
+    """Dense layers with ReLU between them and none after the last."""
+
+    widths: tuple[int, ...]
+    dtype: str
+
+    @nn.compact
+    def __call__(self, x: Float[Array, "*batch F"]) -> Float[Array, "*batch D"]:
+        for index, width in enumerate(self.widths):
+            x = jax.nn.relu(x.astype(self.dtype)) if index else x
+            x = dense(width, self.dtype if index else jnp.float32, name=f"layer_{index}")(x)
+        return x
+
+
+class Tokenizer(nn.Module):
+    """Embeds each row of each block, with an embedding for each block, and adds a learnt table over its rows and steps.
+
+    `pool_steps`: a row's steps become one token, of their largest values. `time_scalars`: a learnt number for each time step is added.
+    """
+
+    widths: tuple[int, ...]  # of the embeddings
+    dtype: str
+    pool_steps: bool = False
+    time_scalars: bool = False
+
+    @nn.compact
+    def __call__(self, blocks: Blocks) -> dict[str, Tokens]:
+        scalars: dict[tuple[str, int], Array] = {}
+        tokens = {}
+        for name, (features, mask) in blocks.items():
+            x = Embedding(self.widths, self.dtype, name=f"{name}_embedding")(features).astype(jnp.float32)
+            if self.pool_steps:
+                x, mask = pool(x, mask)[..., None, :], jnp.any(mask, axis=-1, keepdims=True)
+            x = x + self.param(f"{name}_positions", normal, x.shape[-3:])
+            if self.time_scalars and mask.shape[-1] > 1:
+                clock = "road_users" if name in ROAD_USERS else name, mask.shape[-1]
+                if clock not in scalars:
+                    scalars[clock] = self.param(f"{clock[0]}_times_{clock[1]}", normal, clock[1:])
+                x = x + scalars[clock][:, None]
+            tokens[name] = x.astype(self.dtype).reshape(len(x), -1, x.shape[-1]), mask.reshape(len(x), -1)
+        return tokens
+
+
+def join_tokens(tokens: dict[str, Tokens]) -> Tokens:
+    """Joins the tokens of all blocks."""
+    rows, masks = zip(*tokens.values(), strict=True)
+    return jnp.concatenate(rows, axis=1), jnp.concatenate(masks, axis=1)
+
+
+class Attention(nn.Module):
+    """Multi-head attention of queries [B, T, width] to keys and values that `project` computes; returns the change of the queries.
+
+    Queries that have no valid key get the bias of the last layer.
+    """
+
+    width: int
+    numbers: Transformer
+    dtype: str
+    query_bias: bool = False
+
+    def setup(self) -> None:
+        inner = self.numbers.heads * self.numbers.head_features
+        self.query = dense(inner, self.dtype, use_bias=self.query_bias)
+        self.key = dense(inner, self.dtype, use_bias=False)
+        self.value = dense(inner, self.dtype, use_bias=False)
+        self.out = dense(self.width, self.dtype)
+
+    def project(self, x: Float[Array, "B S D"]) -> tuple[Float[Array, "B S H E"], Float[Array, "B S H E"]]:
+        """Computes keys and values of tokens."""
+        return self._split(self.key(x)), self._split(self.value(x))
+
+    def __call__(
+        self, x: Float[Array, "B T D"], keys_values: tuple[Array, Array], mask: Bool[Array, "B #T S"] | None = None
+    ) -> Float[Array, "B T D"]:
+        keys, values = keys_values
+        heads = None if mask is None else mask[:, None]
+        queries = self._split(self.query(x))
+        found = jax.nn.dot_product_attention(queries, keys, values, mask=heads, implementation=self.numbers.implementation)
+        if mask is not None:
+            found = jnp.where(jnp.any(mask, axis=-1)[..., None, None], found, 0)
+        return self.out(found.reshape(*x.shape[:-1], -1)).astype(jnp.float32)
+
+    def _split(self, x: Float[Array, "B T C"]) -> Float[Array, "B T H E"]:
+        return x.reshape(*x.shape[:-1], self.numbers.heads, self.numbers.head_features)
+
+
+class FeedForward(nn.Module):
+    """A dense layer, GELU, and a dense layer back to the width of the input."""
+
+    multiple: int  # of the input's width, which is the hidden one
+    dtype: str
+
+    @nn.compact
+    def __call__(self, x: Float[Array, "B T D"]) -> Float[Array, "B T D"]:
+        hidden = dense(x.shape[-1] * self.multiple, self.dtype, name="hidden")(x)
+        return dense(x.shape[-1], self.dtype, name="out")(jax.nn.gelu(hidden)).astype(jnp.float32)
+
+
+def select_nearest_keys(
+    x: Float[Array, "B T D"], keys: Float[Array, "B S D"], mask: Bool[Array, "B S"], count: int
+) -> Bool[Array, "B #T S"]:
+    """Selects for each query the `count` valid keys that are nearest in feature space."""
+    if keys.shape[1] <= count:
+        return mask[:, None]
+    square = jnp.sum(keys**2, axis=-1)[:, None] - 2.0 * jnp.einsum("btd,bsd->bts", x, keys)  # less the query's own square
+    distance = jnp.where(mask[:, None], jax.lax.stop_gradient(square), jnp.inf)
+    farthest = -jax.lax.top_k(-distance, count)[0][..., -1:]
+    return (distance <= farthest) & mask[:, None]

@@ -1,0 +1,201 @@
+"""Modules of the encoders: observation -> feature. `encoders` has their config entries.
+
+ReZero (arXiv:2003.04887) in place of normalisation: each attention and each feed-forward part adds its output times a learnt number, which
+is 0 at first.
+"""
+
+from collections.abc import Callable
+from typing import Any
+
+import flax.linen as nn
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+from scenefactory_jax.core.schema import ConfigError
+from scenefactory_jax.core.types import Observation
+from scenefactory_jax.env.observations.flat_vector import flatten_observation
+from scenefactory_jax.env.observations.vmax import Block
+from scenefactory_jax.learning.networks.attention import (
+    Attention,
+    Embedding,
+    FeedForward,
+    Tokenizer,
+    Transformer,
+    dense,
+    join_tokens,
+    normal,
+    select_nearest_keys,
+)
+from scenefactory_jax.learning.networks.late_fusion import Architecture, fuse
+from scenefactory_jax.learning.networks.observation_blocks import Blocks, Reader, check_groups, join_steps
+
+
+class Flat(nn.Module):
+    """The observation as one vector, with its valid flags."""
+
+    @nn.compact
+    def __call__(self, observation: Observation) -> Float[Array, "*batch W"]:
+        check_groups(observation)
+        return flatten_observation(observation)
+
+
+class BlockEncoder(nn.Module):
+    """Base of the encoders of blocks: `encode` sees blocks with one leading axis, whatever the observation has."""
+
+    read: Reader
+
+    @nn.compact
+    def __call__(self, observation: Observation) -> Float[Array, "*batch W"]:
+        blocks = self.read(observation)
+        leading = next(iter(blocks.values())).mask.shape[:-2]
+        flat = {
+            name: Block(features.reshape(-1, *features.shape[-3:]), mask.reshape(-1, *mask.shape[-2:]))
+            for name, (features, mask) in blocks.items()
+        }
+        feature = self.encode(flat)
+        return feature.reshape(*leading, feature.shape[-1])
+
+    def encode(self, blocks: Blocks) -> Float[Array, "B W"]:
+        """Computes the feature."""
+        raise NotImplementedError
+
+
+class MultiLayer(BlockEncoder):
+    """Dense layers for each block as one vector, and two dense layers for all."""
+
+    embedding: tuple[int, ...]
+    width: int
+    dtype: str
+
+    def encode(self, blocks: Blocks) -> Float[Array, "B W"]:
+        parts = []
+        for name, (features, mask) in blocks.items():
+            flat = jnp.where(mask[..., None], features, 0.0).reshape(len(mask), -1)
+            parts.append(Embedding(self.embedding, self.dtype, name=f"{name}_embedding")(flat))
+        hidden = jax.nn.relu(dense(self.width, self.dtype, name="hidden")(jnp.concatenate(parts, axis=-1)))
+        return dense(self.width, self.dtype, name="out")(hidden).astype(jnp.float32)
+
+
+class LateFusion(nn.Module):
+    """The encoders of `late_fusion`."""
+
+    read: Reader
+    architecture: Architecture
+
+    @nn.compact
+    def __call__(self, observation: Observation) -> Float[Array, "*batch W"]:
+        return fuse(self.architecture, join_steps(self.read(observation)))
+
+
+class LatentEncoder(BlockEncoder):
+    """Base of the encoders with attention."""
+
+    numbers: Transformer
+    dtype: str
+
+    def add(self, name: str, x: Array, parts: list[Callable[[Array], Array]]) -> Array:
+        """Adds what the parts compute, one after the other, times one learnt number (ReZero)."""
+        scale = self.param(f"rezero_{name}", nn.initializers.zeros, ())
+        for part in parts:
+            x = x + scale * part(x)
+        return x
+
+    def start(self, count: int, width: int, batch: int, name: str = "latents") -> Float[Array, "B count width"]:
+        """The learnt latents, for each sample."""
+        return jnp.broadcast_to(self.param(name, normal, (count, width)), (batch, count, width))
+
+    def parts(self, name: str, width: int) -> tuple[Attention, FeedForward]:
+        """An attention to latents or tokens of that width, and the feed-forward part behind it."""
+        return self.attention(width, f"{name}_attention"), self.feed_forward(f"{name}_feed_forward")
+
+    def attention(self, width: int, name: str, *, query_bias: bool = False) -> Attention:
+        """An attention that changes what is that wide."""
+        return Attention(width, self.numbers, self.dtype, query_bias, name=name)
+
+    def feed_forward(self, name: str) -> FeedForward:
+        """A feed-forward part."""
+        return FeedForward(self.numbers.feed_forward, self.dtype, name=name)
+
+
+class LatentQuery(LatentEncoder):
+    """Latents that attend to all tokens and to themselves, in rounds with the same weights (Perceiver)."""
+
+    latents: int
+    width: int
+    rounds: int
+
+    def encode(self, blocks: Blocks) -> Float[Array, "B W"]:
+        tokens, mask = join_tokens(Tokenizer(self.numbers.embedding, self.dtype, name="tokens")(blocks))
+        (cross, cross_forward), (own, own_forward) = self.parts("cross", self.width), self.parts("self", self.width)
+        read = _attend(cross, cross.project(tokens), mask[:, None])  # once for all rounds
+        x = self.start(self.latents, self.width, len(mask))
+        for index in range(self.rounds):
+            x = self.add(f"cross_{index}", x, [read, cross_forward])
+            x = self.add(f"self_{index}", x, [_attend(own), own_forward])
+        return jnp.mean(x, axis=1)
+
+
+class HierarchicalLatentQuery(LatentEncoder):
+    """Latents that attend to one block after the other, in their order."""
+
+    latents: int
+    width: int
+
+    def encode(self, blocks: Blocks) -> Float[Array, "B W"]:
+        x = self.start(self.latents, self.width, len(next(iter(blocks.values())).mask))
+        for name, (tokens, mask) in Tokenizer(self.numbers.embedding, self.dtype, name="tokens")(blocks).items():
+            attention, forward = self.parts(name, self.width)
+            x = self.add(name, x, [_attend(attention, attention.project(tokens), mask[:, None]), forward])
+        return jnp.mean(x, axis=1)
+
+
+class MotionTransformer(LatentEncoder):
+    """All tokens attend to the nearest of the road users' tokens, in feature space (MTR); the mean over valid tokens."""
+
+    layers: int
+    nearest: int
+    keys: tuple[str, ...]  # blocks of road users
+
+    def encode(self, blocks: Blocks) -> Float[Array, "B W"]:
+        if not (chosen := [name for name in blocks if name in self.keys]):
+            valid = ", ".join(blocks)
+            raise ConfigError(f"policy.encoder.keys: the encoder mtr needs one of {', '.join(self.keys)}; the observation has {valid}")
+        tokens = Tokenizer(self.numbers.embedding, self.dtype, pool_steps=True, name="tokens")(blocks)
+        joined, mask = join_tokens(tokens)
+        x = joined.astype(jnp.float32)
+        keys, valid = join_tokens({name: tokens[name] for name in chosen})
+        for index in range(self.layers):
+            attention = self.attention(x.shape[-1], f"attention_{index}", query_bias=True)
+            near = select_nearest_keys(x, keys, valid, self.nearest)
+            parts: list[Any] = [_attend(attention, attention.project(keys), near)]
+            parts += [self.feed_forward(f"feed_forward_{index}")] if index else []
+            x = self.add(str(index), x, parts)
+        return jnp.sum(jnp.where(mask[..., None], x, 0.0), axis=1) / jnp.maximum(jnp.sum(mask, axis=1, keepdims=True), 1)
+
+
+class Wayformer(LatentEncoder):
+    """Late fusion: latents of each block attend to its tokens, then to themselves; the mean over the latents of all blocks."""
+
+    latents: int
+    width: int
+    depth: int
+
+    def encode(self, blocks: Blocks) -> Float[Array, "B W"]:
+        features = []
+        for name, (tokens, mask) in Tokenizer(self.numbers.embedding, self.dtype, time_scalars=True, name="tokens")(blocks).items():
+            x = self.start(self.latents, self.width, len(mask), f"{name}_latents")
+            attention, forward = self.parts(f"{name}_0", self.width)
+            x = self.add(f"{name}_0", x, [_attend(attention, attention.project(tokens), mask[:, None]), forward])
+            for index in range(1, self.depth):
+                attention, forward = self.parts(f"{name}_{index}", self.width)
+                x = self.add(f"{name}_{index}", x, [_attend(attention), forward])
+            features.append(x)
+        return jnp.mean(jnp.concatenate(features, axis=1), axis=1)
+
+
+def _attend(
+    attention: Attention, keys_values: tuple[Array, Array] | None = None, mask: Bool[Array, "B #T S"] | None = None
+) -> Callable[[Array], Array]:
+    """The attention as a function of the queries; to themselves without keys."""
+    return lambda x: attention(x, attention.project(x) if keys_values is None else keys_values, mask)

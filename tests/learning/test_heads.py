@@ -1,0 +1,166 @@
+"""Heads on encoders: independent critics, plain arithmetic, shared and separate encoders, PPO with each encoder."""
+
+import functools
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from support import encoding
+from support.abstract_gpu import abstract_gpu
+from support.encoding import ENTRIES, observe
+from support.probes import AGENTS, ppo_config, probe, scenes
+
+from scenefactory_jax.cli import hydra_config as configs
+from scenefactory_jax.core.instantiate import ConfigError, instantiate
+from scenefactory_jax.core.types import SetObservation
+from scenefactory_jax.learning.networks import actor_critic, heads
+from scenefactory_jax.learning.ppo import train_iteration
+from scenefactory_jax.learning.training_loop import make_policy
+
+pytestmark = pytest.mark.usefixtures("quickly")
+
+HEAD = {"hidden": [7, 5], "activation": "relu"}
+POLICY: dict[str, Any] = {
+    "hidden": [7, 5],
+    "activation": "tanh",
+    "shared_encoder": False,
+    "mean_init": [0.5, 0.0, -1.0],
+    "log_std_init": -0.5,
+    "actor_head_scale": 0.01,
+    "dtype": "float32",
+    "observation_groups": {},
+}
+OBSERVATION = observe(0)
+ACTION = jnp.asarray(np.random.default_rng(1).normal(size=(2, 3, 2)), jnp.float32)
+
+
+@pytest.fixture(scope="module", params=["lq", "late_fusion"])
+def critic(request):
+    network = heads.make_critic(encoding.make_encoder(request.param), 2, **HEAD)
+    parameters = jax.jit(network.init)(jax.random.key(0), OBSERVATION, ACTION)
+    return network, encoding.shake(parameters), parameters
+
+
+def test_critics_share_no_weight(critic):
+    network, parameters, drawn = critic
+    values = jax.jit(network.apply)(parameters, OBSERVATION, ACTION)
+    assert values.shape == (2, 2, 3)
+    gradient = jax.jit(jax.grad(lambda p, a: jnp.sum(network.apply(p, OBSERVATION, a)[0]), (0, 1)))(parameters, ACTION)
+    for path, leaf in jax.tree.leaves_with_path(gradient[0]):
+        assert np.any(leaf[0]) and not np.any(leaf[1]), path
+    assert np.any(gradient[1]), "a critic reads the action"
+    kernels = [leaf for path, leaf in jax.tree.leaves_with_path(drawn) if path[-1].key == "kernel"]
+    assert len(kernels) > 3 and all(np.any(leaf[0] != leaf[1]) for leaf in kernels)
+
+
+def test_each_critic_is_the_network_alone(critic):
+    network, parameters, _ = critic
+    values = jax.jit(network.apply)(parameters, OBSERVATION, ACTION)
+    for index in range(2):
+        twice = jax.tree.map(lambda leaf, index=index: jnp.stack([leaf[index]] * 2), parameters)
+        np.testing.assert_allclose(jax.jit(network.apply)(twice, OBSERVATION, ACTION)[0], values[index], atol=1e-5)
+
+
+def test_a_head_equals_plain_arithmetic():
+    """No activation after the last hidden layer: 256 - ReLU - 64 - ReLU - 32 - outputs."""
+    network = heads.make_actor(encoding.make_encoder("none"), 4, **HEAD)
+    parameters = encoding.shake(jax.jit(network.init)(jax.random.key(0), {"ego": OBSERVATION["ego"]}))
+    p = jax.device_get(parameters)["params"]["head"]
+    layer = lambda name, x: x @ p[name]["kernel"] + p[name]["bias"]  # noqa: E731
+    expected = layer("last", layer("layer_1", np.maximum(layer("layer_0", np.asarray(OBSERVATION["ego"])), 0.0)))
+    raw = jax.jit(network.apply)(parameters, {"ego": OBSERVATION["ego"]})
+    np.testing.assert_allclose(raw, expected, atol=1e-5)
+    mean, std = heads.split_gaussian(raw)
+    np.testing.assert_array_equal(mean, raw[..., :2])
+    np.testing.assert_allclose(std, np.log1p(np.exp(expected[..., 2:])) + 0.001, atol=1e-5)
+    assert heads.split_gaussian(jnp.full((1, 4), -100.0))[1].min() == np.float32(0.001)
+
+
+def test_values_are_one_number_an_agent_and_kernels_are_lecuns():
+    network = heads.make_value(encoding.make_encoder("mlp"), hidden=[400], activation="tanh")
+    parameters = jax.jit(network.init)(jax.random.key(0), OBSERVATION)
+    assert jax.jit(network.apply)(parameters, OBSERVATION).shape == (2, 3)
+    kernel = np.asarray(parameters["params"]["head"]["layer_0"]["kernel"])
+    bound = np.sqrt(3.0 / len(kernel))
+    assert 0.98 * bound < np.abs(kernel).max() <= bound and np.abs(np.std(kernel) * np.sqrt(len(kernel)) - 1.0) < 0.05
+
+
+@pytest.mark.parametrize("shared", [False, True])
+def test_an_encoder_is_shared_only_on_demand(shared):
+    policy = actor_critic.make(encoder={"_target_": "lq", **ENTRIES["lq"]}, **{**POLICY, "shared_encoder": shared})
+    drawn = jax.jit(policy.init)(jax.random.key(0), OBSERVATION)
+    mean, log_std, value = jax.jit(policy.apply)(drawn, OBSERVATION)
+    assert mean.shape == (2, 3, 3) and value.shape == (2, 3)
+    np.testing.assert_allclose(mean, np.broadcast_to([0.5, 0.0, -1.0], mean.shape), atol=0.05)
+    np.testing.assert_array_equal(log_std, np.full(3, -0.5, np.float32))
+    derive = jax.jit(jax.grad(lambda p, part: jnp.sum(policy.apply(p, OBSERVATION)[part]), 0), static_argnums=1)
+    touched = {part: {name for name, leaves in derive(encoding.shake(drawn), part)["params"].items() if np.any(jax.tree.leaves(leaves)[0])}
+               for part in (0, 2)}  # fmt: skip
+    names = ("encoder", "encoder") if shared else ("actor_encoder", "critic_encoder")
+    assert touched == {0: {names[0], "actor_head"}, 2: {names[1], "critic_head"}}
+
+
+def test_critics_lower_to_the_kernels_of_sets_on_a_gpu():
+    encoder = encoding.make_encoder("late_fusion", rows=[32, 64])
+    network = heads.make_critic(encoder, 2, **HEAD)
+    parameters = jax.eval_shape(network.init, jax.random.key(0), OBSERVATION, ACTION)
+    loss = jax.jit(jax.grad(lambda p: jnp.sum(network.apply(p, OBSERVATION, ACTION))))
+    with abstract_gpu():
+        assert "encode_set_gradient" in loss.trace(parameters).lower(lowering_platforms=("cuda",)).as_text()
+
+
+def with_neighbours(env):
+    """The probe with a set beside its cue, of which each second row is valid."""
+
+    def observe(scene, state):
+        cue = env.observe(scene, state)["cue"]
+        rows = jnp.broadcast_to(cue[:, None], (AGENTS, 4, 1)) * jnp.arange(4.0)[:, None]
+        return {"cue": cue, "neighbours": SetObservation(rows, jnp.broadcast_to(jnp.arange(4) % 2 == 0, (AGENTS, 4)))}
+
+    return env._replace(observe=observe)
+
+
+SLOW = ("late_fusion", "lqh", "wayformer")
+SHORT = {"lq": {"rounds": 1}, "wayformer": {"depth": 1}}
+
+
+@functools.cache
+def made(worlds):
+    return scenes(worlds)
+
+
+@pytest.mark.parametrize("name", [pytest.param(name, marks=pytest.mark.slow) if name in SLOW else name for name in ENTRIES])
+def test_ppo_trains_each_encoder(name):
+    shared = name not in ("none", "mlp")  # compiles sooner
+    policy = actor_critic.make(encoder={"_target_": name, **ENTRIES[name], **SHORT.get(name, {})}, **{**POLICY, "shared_encoder": shared})
+    config = ppo_config(horizon=4, epochs=2, minibatches=2)
+    trainer = train_iteration.make_trainer(with_neighbours(probe()), policy, config, episode_steps=1000)
+    state = trainer.init(jax.random.key(0), made(4))
+    before = jax.device_get(state.parameters)
+    state, metrics = trainer.train_iteration(state, made(4))
+    assert all(np.isfinite(value) for value in metrics.values()) and metrics["ppo/skipped"] == 0
+    changed = jax.tree.map(lambda old, new: np.any(old != np.asarray(new)), before, state.parameters)["params"]
+    assert np.all([np.isfinite(leaf).all() for leaf in jax.tree.leaves(state.parameters)])
+    parts = {"none": (), "mlp": ("actor_encoder", "critic_encoder")}.get(name, ("encoder",))
+    for part in ("actor_head", "critic_head", *parts):
+        assert any(jax.tree.leaves(changed[part])), part
+
+
+def test_the_policy_of_the_config_reads_the_observation_of_the_config():
+    config = configs.load_config("train", "observations=vmax_road", "policy=actor_critic", "policy/encoder=lqh")
+    observation = {"vmax": jax.ShapeDtypeStruct((2, 1655), jnp.float32)}
+    parameters = jax.eval_shape(make_policy(config).init, jax.random.key(0), observation)["params"]
+    assert parameters["actor_encoder"]["tokens"]["others_positions"].shape == (8, 5, 64)
+    assert parameters["actor_head"]["layer_0"]["kernel"].shape == (128, 256)
+
+
+def test_mistakes_are_named():
+    entry = {"_target_": "lq", **ENTRIES["lq"]}
+    with pytest.raises(ConfigError, match=r"policy\.mean_init: expected 3 numbers"):
+        actor_critic.make(encoder=entry, **{**POLICY, "mean_init": [0.0]})
+    with pytest.raises(ConfigError, match=r"policy\.activation: expected one of elu, relu, tanh, got 'gelu'"):
+        heads.make_actor(encoding.make_encoder("lq"), 4, hidden=[4], activation="gelu")
+    with pytest.raises(ConfigError, match=r"policy\.encoder\.latents: expected an integer >= 1, got 0"):
+        instantiate({"_target_": "make", **{**POLICY, "encoder": {**entry, "latents": 0}}}, builtins=actor_critic, where="policy")()
