@@ -69,11 +69,12 @@ class Scenes:
 class Evaluate(Episodes):
     """The command `evaluate`."""
 
-    run: str
+    run: str | None
     trust: bool
     out: str | None
     overrides: list[str]
     untrained: bool
+    replay_worlds: Seed
     planners: list[str]
     planner_overrides: dict[str, list[str]]
     protocol: Protocol
@@ -340,6 +341,10 @@ def check_evaluate(config: Mapping[str, Any]) -> None:
     check_terminations(config["protocol"]["termination"], where="protocol.termination")
     if unknown := [name for name in config["planners"] if name not in config["planner_overrides"]]:
         raise ConfigError(f"planners: expected names of {', '.join(config['planner_overrides'])}, got {unknown[0]!r}")
+    if config["run"] is None and not config["planners"]:
+        raise ConfigError("run: missing; give run=..., or planners=[...] alone, as `evaluate --help` describes it")
+    if config["run"] is None and config["untrained"]:
+        raise ConfigError("untrained: expected false without a run, got true")
 
 
 def check_study(config: Mapping[str, Any]) -> None:
