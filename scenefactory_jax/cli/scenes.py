@@ -10,8 +10,7 @@ import numpy as np
 from scenefactory_jax.cli import hydra_config, scene_operations
 from scenefactory_jax.cli.scene_schema import SceneOperations
 from scenefactory_jax.core import config as run_config
-from scenefactory_jax.core import result_file
-from scenefactory_jax.core import markdown, schema
+from scenefactory_jax.core import markdown, result_file, schema
 from scenefactory_jax.core.instantiate import ConfigError
 from scenefactory_jax.core.raw_scene import RawScene, SceneError
 from scenefactory_jax.core.safe_names import to_file_name

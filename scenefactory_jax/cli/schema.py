@@ -134,6 +134,7 @@ class Compare:
     """The command `compare`."""
 
     runs: list[str]
+    evaluations: list[str]
     out: str
     metrics: list[str]
     window: Count

@@ -18,8 +18,8 @@ import numpy as np
 from scenefactory_jax.cli import study_plan, study_results
 from scenefactory_jax.cli.evaluate import make_training_callback
 from scenefactory_jax.cli.study_plan import Evaluation, Plan, Training
-from scenefactory_jax.core import folder_lock, result_file
 from scenefactory_jax.core import config as run_config
+from scenefactory_jax.core import folder_lock, result_file
 from scenefactory_jax.core.parallel import gpu_processes
 from scenefactory_jax.core.parallel.gpu_processes import TaskClaims
 from scenefactory_jax.data.loading import scene_source

@@ -32,7 +32,7 @@ class Recording(NamedTuple):
     names: list[str]
     control_hz: float
     goal_radius_m: float
-    failures: dict[str, np.ndarray] | None  # metric -> where it fails, [W, T, A], of scored episodes
+    failures: dict[str, np.ndarray] | None  # of scored episodes, as `scoring.Scores` has them
 
 
 def make_episode_runner(

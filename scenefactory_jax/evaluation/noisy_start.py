@@ -5,6 +5,8 @@ and the episode begins with the position, heading and speed that it then has: th
 car starts with its wheels straight and without a yaw rate. A planner that plays its log back is not moved.
 """
 
+import functools
+
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
@@ -12,7 +14,7 @@ from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 from scenefactory_jax.core.boxes import find_overlaps
 from scenefactory_jax.core.geometry import dot, heading_vector, safe_norm
 from scenefactory_jax.core.pytree import replace
-from scenefactory_jax.core.types import Scene
+from scenefactory_jax.core.types import AgentLog, Agents, Scene
 from scenefactory_jax.dynamics.bicycle_waymax import Body, integrate_acceleration
 from scenefactory_jax.evaluation.metrics import waymax_steps
 from scenefactory_jax.evaluation.scoring import EVEN_S, STEP_S, list_paths
@@ -23,7 +25,7 @@ from scenefactory_jax.roadgraph.traffic_lights import read_light_states
 WORLDS_AT_ONCE = 4  # on the device; memory grows with them
 
 
-def perturb_starts(keys: PRNGKeyArray, scene: Scene, noise: NoisyStart, *, past_rows: int) -> Scene:
+def perturb_starts(keys: Array, scene: Scene, noise: NoisyStart, *, past_rows: int) -> Scene:
     """Moves the starts of all agents of batched scenes, and the rows of their logs before it; later rows stay as they are.
 
     An agent without a logged state `past_rows` before its start, or with a log of other time steps, starts as recorded.
@@ -32,13 +34,17 @@ def perturb_starts(keys: PRNGKeyArray, scene: Scene, noise: NoisyStart, *, past_
         keys: one a world.
         past_rows: rows of the log before the start, a tenth of a second apart.
     """
-    perturb = jax.jit(lambda worlds: jax.lax.map(lambda world: _perturb(*world, noise, past_rows), worlds, batch_size=WORLDS_AT_ONCE))
-    grid = scene.road_grid
-    agents, log = perturb((keys, replace(scene, road_grid=None)))
-    return replace(scene, agents=agents, log=log, road_grid=grid)
+
+    @jax.jit
+    def perturb(keys: Array, worlds: Scene) -> tuple[Agents, AgentLog]:
+        perturb_one = functools.partial(_perturb, noise=noise, past_rows=past_rows)
+        return jax.lax.map(lambda world: perturb_one(*world), (keys, worlds), batch_size=WORLDS_AT_ONCE)
+
+    agents, log = perturb(keys, replace(scene, road_grid=None))
+    return replace(scene, agents=agents, log=log)
 
 
-def _perturb(key: PRNGKeyArray, scene: Scene, noise: NoisyStart, past_rows: int) -> tuple:
+def _perturb(key: PRNGKeyArray, scene: Scene, *, noise: NoisyStart, past_rows: int) -> tuple[Agents, AgentLog]:
     """Draws actions until one drives without a failure, at most `redraws` more, and returns agents and logs; of one world."""
     agents, log = scene.agents, scene.log
 
@@ -91,7 +97,7 @@ def _fails(scene: Scene, driven: Body, car: Int[Array, ""]) -> Bool[Array, ""]:
     place, turn = (jnp.concatenate([getattr(track, name)[:, :rows] for track in tracks]) for name in ("position", "yaw"))
     present = jnp.concatenate([track.valid[:, :rows] for track in tracks]) & (jnp.arange(len(turn)) != car)[:, None]
     sizes = jnp.concatenate([scene.agents.size, scene.traffic_log.size])
-    lane = jax.vmap(lambda *at: waymax_steps.find_front_lane(*at, size, paths))(position, yaw)
+    lane = jax.vmap(lambda place, turn: waymax_steps.find_front_lane(place, turn, size, paths))(position, yaw)
 
     def fails(row: Int[Array, ""]) -> Bool[Array, ""]:
         here = position[row], yaw[row], size

@@ -12,7 +12,7 @@ from scenefactory_jax.core import column_table, result_file
 Records = Mapping[str, np.ndarray]  # column -> one value for every agent
 RESULT = "evaluation.json"  # settings of the evaluation, beside the records
 FILES = (RESULT, "agents-*.csv", "agents-*.parquet", "comparison-*.png", "failures.json", "failures-*", "learning.png", "outcomes.png")
-FILES += ("planners.*", "replay-*.html", "safety.png", "trajectories.png", "video.gif", "video.mp4", "report.md")  # of an evaluation's folder
+FILES += ("planners.*", "replay-*.html", "safety.png", "trajectories.png", "video.gif", "video.mp4", "report.md")  # of an evaluation
 ROUTE_EVENTS = ("red_light", "stop_sign", "off_route")  # records of before routes lack them: no agent had such an event
 EVENTS = ("numerical_error", "goal_reached", "collision", "out_of_bounds", "road_edge_contact", *ROUTE_EVENTS)
 COLUMNS: dict[str, type] = {  # further columns are kept and may serve a breakdown
@@ -117,4 +117,5 @@ def read_all(folder: Path) -> dict[str, dict[str, np.ndarray]]:
 
 def read_folder(folder: Path) -> dict[str, dict[str, np.ndarray]]:
     """Reads the records of the trained policy from an evaluation's folder, by protocol; empty: it has none."""
-    return {path.stem.removeprefix("agents-"): read_records(path) for path in sorted(folder.glob("agents-*.csv")) if path.stem.count("-") == 1}
+    paths = (path for path in sorted(folder.glob("agents-*.csv")) if path.stem.count("-") == 1)
+    return {path.stem.removeprefix("agents-"): read_records(path) for path in paths}

@@ -31,6 +31,7 @@ from scenefactory_jax.roadgraph.traffic_lights import read_light_states
 
 STEP_S = 0.1  # between states
 EVEN_S = 1e-3  # by which a time step may differ
+COUNTED = "counted"  # whether a state counts, beside the failures of metrics
 AT_START_M = 0.01  # a car this near to its start began there
 PATHS = 10  # of an agent that are read, its best ones
 WORLDS_AT_ONCE = 4  # on the device; memory grows with them
@@ -49,7 +50,7 @@ class Scores(NamedTuple):
     """Scores of all worlds, on the host."""
 
     values: dict[str, np.ndarray]  # metric -> [W, A], NaN where it cannot be computed
-    failures: dict[str, np.ndarray]  # metric -> whether it fails after each control step, [W, T, A], of the worlds that are recorded
+    failures: dict[str, np.ndarray]  # metric -> whether it fails after each control step, [W, T, A], of the recorded worlds; and COUNTED
 
 
 def make_scorer(
@@ -143,7 +144,7 @@ def score_world(
         steps = measure_steps(record, dt=STEP_S, surrogates=surrogates)
         record = record._replace(counted=cut_at_failure(record, steps)) if settings.ends_at_failure else record
         metrics = episode_metrics.collect_metrics(record, steps, dt=STEP_S)
-        failures = find_failures(record, steps, metrics, dt=STEP_S)
+        failures = find_failures(record, steps, metrics, dt=STEP_S) | {COUNTED: record.counted}
         values = metrics | episode_scores.compute_scores(metrics)
         values = {name: jnp.where(valid, value, jnp.nan) for name, (value, valid) in values.items()}
         return values, {name: mask[past_rows + 1 :] for name, mask in failures.items()}

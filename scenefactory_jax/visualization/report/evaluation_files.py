@@ -49,7 +49,7 @@ def write(
         command: repeats the evaluation.
     """
     out.mkdir(parents=True, exist_ok=True)
-    episodes = circumstances.describe(config)
+    episodes = _describe_episodes(config, settings)
     records, trajectories, pictures, pages = {}, [], {}, {}
     for evaluation in evaluated:
         label, recording = evaluation.label, evaluation.recording
@@ -59,9 +59,9 @@ def write(
         metadata = {"protocol": request["protocol"], "termination": evaluation.protocol, "policy": evaluation.policy}
         metadata |= {"config_digest": evaluation.digest, "versions": versions}
         write_records(out / name_file(label), evaluation.records, metadata=metadata)
-        if recording is not None and recording.failures is not None and settings["replay_worlds"]:
+        if recording is not None and recording.failures is not None and (shown := settings["replay_worlds"]):
             page = out / f"replay-{label.replace(', ', '-')}.html"
-            pages[f"Episodes, {label}"] = episode_page.write(page, recording, evaluation.records, worlds=settings["replay_worlds"])
+            pages[f"Episodes, {label}"] = episode_page.write(page, recording, evaluation.records, worlds=shown)
         if recording is None or evaluation.policy != "trained":
             continue
         if settings["video"]["enable"] and not trajectories:
@@ -73,9 +73,9 @@ def write(
     summary = {name: statistics.summarise(rows, bootstrap=settings["bootstrap"], seed=settings["seed"]) for name, rows in records.items()}
     metrics = metrics_csv.read(run) if run else []
     files = {f"Agents, {name}": out / name_file(name) for name in records} | pages
-    if any(", " in name and not name.endswith(evaluation_report.UNTRAINED) for name in records):
-        files |= planner_table.write(out, *({name: part[name] for name in part if not name.endswith(evaluation_report.UNTRAINED)} for part in (summary, records)))
     files["Failures, ranked"] = failure_pictures.write(out, records, pictures)
+    if rows := planner_table.select_policies(summary):
+        files["Planners and metrics"] = planner_table.write(out, rows, records)
     if run and metrics:
         files["Metrics of the training"] = run / metrics_csv.FILE
     report = evaluation_report.write(
@@ -96,6 +96,12 @@ def write(
     return Result(out, records, summary, report)
 
 
+def _describe_episodes(config: Mapping[str, Any], settings: Mapping[str, Any]) -> dict[str, str]:
+    noise = (settings.get("protocol", {}).get("scores") or {}).get("noise")
+    added = {"Second before the start": "one random held action (V-Max's noisy start)"} if noise else {}
+    return circumstances.describe(config) | added
+
+
 def format_title(name: str, request: Mapping[str, Any]) -> str:
     """Formats the heading; only the run's own held-out scenes are called scenes not seen in training."""
     if request["scenes"] is not None:
@@ -114,9 +120,11 @@ def _draw_figures(
     """Caption -> picture."""
     drawn = {}
     for name in summary:
-        if (baseline := name + evaluation_report.UNTRAINED) in summary:
+        if (baseline := name + planner_table.UNTRAINED) in summary:
             figure = plots.rates_figure({"untrained": summary[baseline], "trained": summary[name]})
             drawn[f"Untrained and trained, {name}"] = figure, f"comparison-{name}"
+    if rows := planner_table.select_policies(summary):
+        drawn["Planners and metrics"] = planner_table.draw_figure(rows), planner_table.FILE
     if metrics:
         drawn["Training"] = plots.learning_figure(metrics), "learning"
     first = next(iter(records))

@@ -13,11 +13,11 @@ from scenefactory_jax.evaluation.metrics.agent_metrics import METRICS
 from scenefactory_jax.evaluation.records import Records
 from scenefactory_jax.visualization.birds_eye.drawing import MARKS
 from scenefactory_jax.visualization.report import document, planner_table, policy_comparison, tables
+from scenefactory_jax.visualization.report.planner_table import UNTRAINED
 from scenefactory_jax.visualization.report.tables import Summary, format_estimate
 
 BREAKDOWNS = ("surface", "film_mm")  # columns of records
 RATES = ("success_rate", "clean_success_rate", "collision_rate", "road_edge_rate", "crash_rate", "mean_time_to_goal_s")  # of breakdowns
-UNTRAINED = ", untrained"  # ending of the name of a baseline's records
 MAX_GROUPS, MAX_FAILURES = 20, 40  # rows of tables; the CSV files have all
 
 
@@ -50,19 +50,18 @@ def write(
         failure_pictures: name of records -> failure type -> picture of the worst; "film" -> their video.
     """
     resampling = {"bootstrap": settings["bootstrap"], "seed": settings["seed"]}
-    others = {name: rows for name, rows in records.items() if ", " in name and not name.endswith(UNTRAINED)}  # planners
+    rows = planner_table.select_policies(records)
     trained = {name: rows for name, rows in records.items() if ", " not in name}
     first, thresholds = next(iter(trained or records)), failures.list_thresholds(settings["failures"])
-    rows = {name: table for name, table in records.items() if not name.endswith(UNTRAINED)}
     return document.write(
         folder / "report.md",
         f"# {title}",
         _headline(first, summary[first], records[first]),
         document.section("Episodes", markdown.format_table(["", ""], list(episodes.items())) if episodes else ""),
-        document.section("Results", *_results({name: summary[name] for name in trained | others}, trained | others)),
+        document.section("Results", *_results({name: summary[name] for name in trained | rows}, trained | rows)),
         document.section("Comparison", *(_compare(name, summary, records, resampling) for name in trained if name + UNTRAINED in records)),
-        document.section("Planners and metrics", *_tabulate_planners({name: summary[name] for name in rows}, rows) if others else ()),
-        document.section("Differences", *policy_comparison.compare_policies(rows, resampling) if others else ()),
+        document.section("Planners and metrics", *_tabulate_planners({name: summary[name] for name in rows}, rows)),
+        document.section("Differences", *policy_comparison.compare_policies(rows, resampling)),
         document.section("Video", *(document.picture(folder, path, caption) for caption, path in videos.items())),
         document.section("By condition", *_break_down(first, records[first], resampling)),
         document.section(
@@ -103,6 +102,8 @@ def _headline(name: str, summary: Summary, records: Records) -> str:
 
 
 def _tabulate_planners(summary: Mapping[str, Summary], records: Mapping[str, Records]) -> list[str]:
+    if not records:
+        return []
     return [planner_table.format_table(summary, records), planner_table.NOTE, tables.explain_marks(summary.values())]
 
 

@@ -3,6 +3,7 @@
 import csv
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import TypeVar
 
 import matplotlib
 import numpy as np
@@ -17,14 +18,22 @@ from scenefactory_jax.evaluation.statistics import Estimate
 from scenefactory_jax.visualization.report import document, plots, tables
 from scenefactory_jax.visualization.report.tables import Summary
 
+Content = TypeVar("Content")
 SCORED = ("accuracy", "overlap", "off_road", "red_light_run", "progression", "vmax_score", "nuplan_score")
 COUNTED = ("success_rate", "clean_success_rate", "collision_rate", "road_edge_rate", "mean_time_to_goal_s")  # of protocols without scores
 ROUTED = ("clean_completion_rate", "route_completion", "red_light_rate")  # of those with routes
+UNTRAINED = ", untrained"  # ending of the label of a baseline
 FILE = "planners"
 NOTE = (
-    "Brackets are 95 % intervals over scenes. n: episodes that have a value; a metric that cannot be computed (no lights, no lane links, no "
+    "Brackets are 95 % intervals over scenes. n: episodes that have a value; a metric that cannot be computed (no lights, lane links or "
     "speed limits, a recorded driver that stands) is absent and no part of its mean."
 )
+
+
+def select_policies(table: Mapping[str, Content]) -> dict[str, Content]:
+    """Selects the rows, by label: the trained policy and all planners; none where there are no planners."""
+    rows = {label: content for label, content in table.items() if not label.endswith(UNTRAINED)}
+    return rows if any(", " in label for label in rows) else {}
 
 
 def choose_metrics(summary: Mapping[str, Summary]) -> tuple[str, ...]:
@@ -52,8 +61,8 @@ def _format_cell(estimate: Estimate | None) -> str:
     return "absent (n = 0)" if estimate is None or not estimate.count else f"{tables.format_estimate(estimate)} (n = {estimate.count})"
 
 
-def write(folder: Path, summary: Mapping[str, Summary], records: Mapping[str, Records]) -> dict[str, Path]:
-    """Writes planners.csv, planners.md and planners.png, and returns caption -> file."""
+def write(folder: Path, summary: Mapping[str, Summary], records: Mapping[str, Records]) -> Path:
+    """Writes planners.md and planners.csv, and returns the path of the latter."""
     metrics = choose_metrics(summary)
     with (folder / f"{FILE}.csv").open("w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file)
@@ -63,8 +72,7 @@ def write(folder: Path, summary: Mapping[str, Summary], records: Mapping[str, Re
             cells = [cell for name in metrics for cell in _list_cells(row.get(name))]
             writer.writerow([label.partition(", ")[0], name_policy(label), len(records[label]["scene"]), *cells])
     document.write(folder / f"{FILE}.md", "# Planners and metrics", format_table(summary, records), NOTE)
-    plots.save(draw_figure(summary, metrics), folder / f"{FILE}.png")
-    return {"Planners and metrics, CSV": folder / f"{FILE}.csv", "Planners and metrics": folder / f"{FILE}.png"}
+    return folder / f"{FILE}.csv"
 
 
 def _list_cells(estimate: Estimate | None) -> list[float | int | None]:
@@ -73,8 +81,9 @@ def _list_cells(estimate: Estimate | None) -> list[float | int | None]:
 
 
 @matplotlib.rc_context(plots.STYLE)
-def draw_figure(summary: Mapping[str, Summary], metrics: Sequence[str]) -> Figure:
+def draw_figure(summary: Mapping[str, Summary]) -> Figure:
     """Draws bars with 95 % intervals: a panel a metric, a bar a policy; "absent" where there is no value."""
+    metrics = choose_metrics(summary)
     figure = Figure(figsize=(1.0 + 1.6 * len(metrics), 0.34 * len(summary) + 1.0), layout="constrained")
     panels = figure.subplots(1, len(metrics), sharey=True, squeeze=False)[0]
     for axes, name in zip(panels, metrics, strict=True):

@@ -1,6 +1,6 @@
 """Paired differences on the same episodes, between a policy and the others or between two evaluations, corrected for their number."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import NamedTuple
 
 from scenefactory_jax.core import markdown

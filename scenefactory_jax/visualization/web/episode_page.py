@@ -7,12 +7,13 @@ import jax
 import numpy as np
 
 from scenefactory_jax.core.pytree import replace, unchecked
-from scenefactory_jax.core.types import LIGHT_STATES, TrafficControls
+from scenefactory_jax.core.types import LIGHT_STATES, Boxes, TrafficControls
 from scenefactory_jax.env import rollout
 from scenefactory_jax.env.rollout import StepRecord
 from scenefactory_jax.evaluation.episode_records import Recording
 from scenefactory_jax.evaluation.metrics.step_failures import LABELS
 from scenefactory_jax.evaluation.records import Records
+from scenefactory_jax.evaluation.scoring import COUNTED
 from scenefactory_jax.visualization.web import replay_data, replay_page
 from scenefactory_jax.visualization.web.road_posts import Light, RoadPosts
 
@@ -50,8 +51,9 @@ def _make_step_records(recording: Recording, worlds: int) -> StepRecord:
     still = np.asarray(recording.weather.film_mm)[:worlds]
     knots = zip(np.asarray(rain.time_s), np.asarray(rain.film_mm), still, strict=True)
     film = np.stack([np.interp(time, at, depth) if len(at) else np.full(len(time), now) for at, depth, now in knots])
+    traffic = unchecked(Boxes, **vars(frames.traffic), **dict.fromkeys(("elevation", "yaw_rate", "mass")))
     known = {"active": frames.active, "position": frames.position, "yaw": frames.yaw, "goal": frames.goal, "events": frames.events}
-    known |= {"time_s": np.tile(time, (worlds, 1)), "film_mm": film, "traffic": frames.traffic, "terms": {}}
+    known |= {"time_s": np.tile(time, (worlds, 1)), "film_mm": film, "traffic": traffic, "terms": {}}
     known |= {"speed": np.linalg.norm(frames.velocity, axis=-1), "friction_utilization": frames.friction_utilization}
     known |= {"goal_distance": np.linalg.norm(frames.goal - frames.position, axis=-1)}
     missing = ("steer", "action", "ttc", "edge_ttc", "grip", "slip", "contact_force", "wheels", "joints")
@@ -59,12 +61,16 @@ def _make_step_records(recording: Recording, worlds: int) -> StepRecord:
 
 
 def list_failures(recording: Recording, records: Records, world: int) -> dict[int, dict[str, list[list[int]] | None]]:
-    """Lists the spans of steps in which metrics fail: car -> metric -> [first, last] of each; None: the metric has no value."""
+    """Lists the spans of steps in which metrics fail, and those that count: car -> metric -> [first, last] of each; None: the metric has no
+    value."""
     rows = np.flatnonzero(np.asarray(records["world"]) == world)
     masks = {name: mask[world] for name, mask in (recording.failures or {}).items()}
-    spans = lambda row, name, car: None if np.isnan(records[name][row]) else replay_data.spans(masks[name][:, car])  # noqa: E731
-    cars = ((row, int(records["agent"][row])) for row in rows.tolist())
-    return {car: {name: spans(row, name, car) for name in masks} for row, car in cars}
+
+    def find_spans(row: int, name: str) -> list[list[int]] | None:
+        absent = name in LABELS and np.isnan(records[name][row])
+        return None if absent else replay_data.spans(masks[name][:, records["agent"][row]])
+
+    return {int(records["agent"][row]): {name: find_spans(row, name) for name in (*LABELS, COUNTED)} for row in rows.tolist()}
 
 
 def list_posts(controls: TrafficControls) -> RoadPosts:

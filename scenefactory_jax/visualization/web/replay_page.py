@@ -22,7 +22,7 @@ from scenefactory_jax.visualization.web.term_styles import term_looks
 if TYPE_CHECKING:
     from IPython.display import HTML
 
-SCRIPTS = ("data.js", "state.js", "view.js", "road.js", "map.js", "charts.js", "rewards.js", "failures.js", "page.js")  # the last one starts the page
+SCRIPTS = ("data.js", "state.js", "view.js", "road.js", "map.js", "charts.js", "rewards.js", "failures.js", "page.js")  # the last starts
 
 
 class ReplayError(ValueError):
@@ -64,7 +64,8 @@ def document(
         posts: lights and stop signs of the worlds (`road_posts.find_posts`); empty: not shown.
         title: of the page.
         goal_radius_m: of the goals' circles.
-        failures: of each world, car -> metric -> [first, last] step of each failure, None for a metric without a value; empty: not shown.
+        failures: of each world, car -> metric -> [first, last] step of each failure, None for a metric without a value, and "counted" ->
+            [first, last] of the steps that count; empty: not shown.
         metrics: name -> label of what fails.
 
     Raises:

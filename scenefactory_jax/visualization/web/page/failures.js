@@ -1,15 +1,20 @@
 // ---- failures: where the metrics of a scored episode fail, a row for each metric over the selected car's time
 
+/** Metrics of a car and their failures, in the order of the file. */
+const metricsOf = (car) => (app.world.metrics[car?.slot] ? Object.keys(replay.metrics).map((name) => [name, app.world.metrics[car.slot][name]]) : []);
+/** The last step that counts in scores. */
+const lastCounted = (car) => app.world.metrics[car.slot].counted.at(-1)?.[1] ?? 0;
+
 /** All failures of a car in order: {name, first, last}. */
 function failuresOf(car) {
-  const metrics = Object.entries(app.world.metrics[car.slot] ?? {});
+  const metrics = metricsOf(car);
   const all = metrics.flatMap(([name, spans]) => (spans ?? []).map(([first, last]) => ({ name, first, last: Math.min(last, app.world.end) })));
   return all.filter(({ first }) => first <= app.world.end).sort((a, b) => a.first - b.first);
 }
 
 function makeFailures() {
   const car = app.world.bySlot.get(app.selected);
-  const metrics = Object.entries(car ? (app.world.metrics[car.slot] ?? {}) : {});
+  const metrics = metricsOf(car);
   $("failures").hidden = !metrics.length;
   if (!metrics.length) return;
   const names = (chosen) => chosen.map(([name]) => replay.metrics[name]).join(", ");
@@ -17,7 +22,9 @@ function makeFailures() {
   const rows = metrics.filter(([, spans]) => spans?.length).map(([name]) => failureRow(car, name));
   const lines = Object.entries(notes).filter(([, chosen]) => chosen.length);
   const texts = lines.map(([title, chosen]) => element("p", { className: "quiet", textContent: `${title}: ${names(chosen)}.` }));
-  $("failures").replaceChildren(element("b", { textContent: "Where metrics fail" }), ...rows, ...texts);
+  const count = lastCounted(car) < timeOf(car)[1] ? `scores count up to ${number(seconds(app.world, lastCounted(car)), 2)} s` : "";
+  const heading = element("b", { textContent: "Where metrics fail" }, element("small", { className: "quiet", textContent: count }));
+  $("failures").replaceChildren(heading, ...rows, ...texts);
 }
 
 function failureRow(car, name) {
@@ -39,7 +46,9 @@ function failureRow(car, name) {
   });
   const label = element("span", { textContent: replay.metrics[name], title: replay.metrics[name] });
   const at = element("span", { className: "at", textContent: `${number(seconds(app.world, found[0].first), 2)} s` });
-  return element("div", { className: "failure" }, label, element("div", { className: "track" }, ...marks, element("i")), at);
+  const over = element("div", { className: "over" });
+  over.style.left = `${place(lastCounted(car))}%`;
+  return element("div", { className: "failure" }, label, element("div", { className: "track" }, over, ...marks, element("i")), at);
 }
 
 /** Moves the rows' cursors to the shown time, and marks the failures of now. */
