@@ -129,7 +129,8 @@ def test_the_same_seed_gives_the_same_bits(plain):
     """Two runs of one compiled evaluation, and another that is compiled anew, not read from a cache."""
     config = asked("nowhere")
     task = hydra_config.load_config("train", *ALONE, *hydra_config.list_overrides(config["protocol"]["settings"]), *SMALL)
-    task = hydra_config.apply_overrides(task, config["planner_overrides"]["random"]) | {"termination": load_terminations(["whole"])["whole"]}
+    task = hydra_config.apply_overrides(task, config["planner_overrides"]["random"])
+    task["termination"] = load_terminations(["whole"])["whole"]
     scenes = scene_source.load_heldout_scenes(task["scenes"], path=None)
     scores = schema.read(config["protocol"]["scores"], ScoreSettings)
     cached = jax.config.jax_enable_compilation_cache

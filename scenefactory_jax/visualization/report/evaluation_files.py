@@ -56,9 +56,7 @@ def write(
         if not records:
             begin_folder(out, {**request, "episodes": episodes, **{key: settings[key] for key in ("seed", "repeats", "untrained")}})
         records[label] = evaluation.records
-        metadata = {"protocol": request["protocol"], "termination": evaluation.protocol, "policy": evaluation.policy}
-        metadata |= {"config_digest": evaluation.digest, "versions": versions}
-        write_records(out / name_file(label), evaluation.records, metadata=metadata)
+        _write_agents(out, evaluation, protocol=request["protocol"], versions=versions)
         if recording is not None and recording.failures is not None and (shown := settings["replay_worlds"]):
             page = out / f"replay-{label.replace(', ', '-')}.html"
             pages[f"Episodes, {label}"] = episode_page.write(page, recording, evaluation.records, worlds=shown)
@@ -94,6 +92,12 @@ def write(
         files=files,
     )
     return Result(out, records, summary, report)
+
+
+def _write_agents(out: Path, evaluation: Evaluated, *, protocol: str, versions: Mapping[str, str]) -> None:
+    metadata = {"protocol": protocol, "termination": evaluation.protocol, "policy": evaluation.policy}
+    metadata |= {"config_digest": evaluation.digest, "versions": versions}
+    write_records(out / name_file(evaluation.label), evaluation.records, metadata=metadata)
 
 
 def _describe_episodes(config: Mapping[str, Any], settings: Mapping[str, Any]) -> dict[str, str]:
