@@ -82,9 +82,10 @@ def make_scorer(
         thinned = jax.tree.map(lambda leaf: leaf[:, stride - 1 :: stride], frames)
         worlds = replace(scene, road_grid=None)
         values, failures = jax.device_get(score(worlds, start, thinned, find_speed_limits(scene)))
-        held = np.maximum(np.arange(frames.active.shape[1]) - (stride - 1), 0) // stride  # a state lasts until the next one
-        begun = (np.arange(len(held)) >= stride - 1)[:, None]
-        return Scores(values, {name: mask[:, held] & begun for name, mask in failures.items()})
+        step = np.arange(frames.active.shape[1])
+        held = np.maximum(step - (stride - 1), 0) // stride  # a failure lasts from its state until the next one
+        marks = {name: mask[:, held] & (step >= stride - 1)[:, None] for name, mask in failures.items()}
+        return Scores(values, marks | {COUNTED: failures[COUNTED][:, step // stride]})
 
     return score_all
 

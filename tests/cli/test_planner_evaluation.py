@@ -100,7 +100,7 @@ def test_the_page_marks_where_metrics_fail(plain):
                 value = records[name][row]
                 fails = value > 0 if name in EVENTS else value < 1
                 assert (found[name] is None) == np.isnan(value) and bool(found[name]) == fails, (label, row, name)
-                assert all(first <= begin <= end <= last for begin, end in found[name] or []), name
+                assert all(first <= begin <= end and begin <= last for begin, end in found[name] or []), name
                 marked += len(found[name] or [])
     assert marked > 4
 

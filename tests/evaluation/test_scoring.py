@@ -106,7 +106,7 @@ def test_failures_are_marked_from_the_state_in_which_they_happen():
     for name in ("overlap", "at_fault_collision"):
         assert np.flatnonzero(failures[name][:, 0]).tolist() == list(range(overlap, overlap + HZ // 10)), name
     assert not failures["at_fault_collision"][:, 1].any() and failures["overlap"][:, 1].any()
-    assert np.flatnonzero(failures[scoring.COUNTED][:, 0])[-1] == overlap + HZ // 10 - 1
+    assert np.flatnonzero(failures[scoring.COUNTED][:, 0])[[0, -1]].tolist() == [0, overlap]
     ttc = np.flatnonzero(failures["ttc_within_bound"][:, 0])[0]
     assert SPEED * (ttc + 1) / HZ == pytest.approx(WALL_M - LENGTH_M - 0.95 * SPEED, abs=0.1 * SPEED)
     assert not failures["off_road"].any()

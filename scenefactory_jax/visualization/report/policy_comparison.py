@@ -11,10 +11,8 @@ from scenefactory_jax.evaluation.statistics import Estimate
 from scenefactory_jax.visualization.report import tables
 from scenefactory_jax.visualization.report.planner_table import name_policy
 
-COMPARED = (
-    "vmax_score", "nuplan_score", "accuracy", "overlap", "off_road", "red_light_run", "progression", "at_fault_collision", "success_rate",
-    "clean_success_rate", "clean_completion_rate", "collision_rate", "road_edge_rate", "red_light_rate",
-)  # fmt: skip
+SCORED = ("vmax_score", "nuplan_score", "accuracy", "overlap", "at_fault_collision", "off_road", "red_light_run", "progression")
+COUNTED = ("success_rate", "clean_success_rate", "clean_completion_rate", "collision_rate", "road_edge_rate", "red_light_rate")
 LEVEL = 0.05
 
 
@@ -46,19 +44,16 @@ def compare_policies(records: Mapping[str, Records], resampling: Mapping[str, in
 
 
 def compare_pairs(pairs: Mapping[str, Pair], resampling: Mapping[str, int], *, heading: str) -> list[str]:
-    """Formats a table: a row for each metric of COMPARED, a column a pair, and what Holm's correction leaves.
+    """Formats a table: a row for each metric of SCORED, or of COUNTED where there are no scores, a column a pair, marked by Holm's correction.
 
     Raises:
         RecordsError: a pair of different scenes.
     """
-    found = {
-        (name, metric): estimate
-        for name, pair in pairs.items()
-        for metric, estimate in statistics.difference(pair.before, pair.after, **resampling).items()
-        if metric in COMPARED
-    }
+    differences = {name: statistics.difference(pair.before, pair.after, **resampling) for name, pair in pairs.items()}
+    compared = SCORED if any(SCORED[0] in estimates for estimates in differences.values()) else COUNTED
+    found = {(name, metric): row[metric] for name, row in differences.items() for metric in compared if metric in row}
     adjusted = statistics.adjust_holm({key: estimate.p for key, estimate in found.items() if estimate.p is not None})
-    metrics = [metric for metric in COMPARED if any((name, metric) in found for name in pairs)]
+    metrics = [metric for metric in compared if any((name, metric) in found for name in pairs)]
     cells = {key: _format_difference(estimate, adjusted.get(key, 1.0)) for key, estimate in found.items()}
     rows = [[METRICS[metric].label, *(cells.get((name, metric), "") for name in pairs)] for metric in metrics]
     return [
