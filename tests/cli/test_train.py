@@ -639,7 +639,7 @@ RUNS = (
 
 
 SUITES = ("recorded_routes", "route100", "conflict", "conflict_reactive", "grip", "grip_hidden", "grip_stops")  # with routes
-SUITES += ("vmax", "nuplan")
+SUITES += ("vmax", "vmax_noise", "nuplan")
 
 
 @pytest.mark.parametrize("name", names("protocol"))

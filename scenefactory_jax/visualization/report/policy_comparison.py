@@ -44,7 +44,7 @@ def compare_policies(records: Mapping[str, Records], resampling: Mapping[str, in
 
 
 def compare_pairs(pairs: Mapping[str, Pair], resampling: Mapping[str, int], *, heading: str) -> list[str]:
-    """Formats a table: a row for each metric of SCORED, or of COUNTED where there are no scores, a column a pair, marked by Holm's correction.
+    """Formats a table: a row for each metric of SCORED, or of COUNTED where there are no scores, a column a pair, marked by Holm's rule.
 
     Raises:
         RecordsError: a pair of different scenes.
