@@ -4,6 +4,7 @@ States are a tenth of a second apart, as the published metrics want them. The pa
 rows of the log before the start (`scenes.pack.log_from: start`); without, an episode begins with the state at its start.
 """
 
+import dataclasses
 import functools
 from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
@@ -71,12 +72,7 @@ def make_scorer(
     stride, surrogates = round(STEP_S * control_hz), schema.read(config["step_metrics"], StepMetricsConfig, where="step_metrics")
     if stride < 1 or abs(stride / control_hz - STEP_S) > 1e-6:
         raise ConfigError(f"timing.control_hz: expected a multiple of {1 / STEP_S:g} for scores, got {control_hz:g}")
-
-    @jax.jit
-    def score(scene: Scene, start: Start, frames: EpisodeFrame, limits: tuple[Array, Array]) -> tuple[dict[str, Array], dict[str, Array]]:
-        score_one = functools.partial(score_world, settings=settings, surrogates=surrogates, mass=mass)
-        values, failures = jax.lax.map(lambda world: score_one(*world), (scene, start, frames, limits), batch_size=WORLDS_AT_ONCE)
-        return values, {name: mask[:recorded_worlds] for name, mask in failures.items()}
+    score = make_program(dataclasses.replace(settings, noise=None), surrogates, mass, recorded_worlds)
 
     def score_all(scene: Scene, start: Start, frames: EpisodeFrame) -> Scores:
         thinned = jax.tree.map(lambda leaf: leaf[:, stride - 1 :: stride], frames)
@@ -88,6 +84,19 @@ def make_scorer(
         return Scores(values, marks | {COUNTED: failures[COUNTED][:, step // stride]})
 
     return score_all
+
+
+@functools.lru_cache(maxsize=4)  # all planners of an evaluation have one program
+def make_program(settings: ScoreSettings, surrogates: StepMetricsConfig, mass: float, recorded_worlds: int) -> Callable[..., Any]:
+    """Makes the compiled function (scenes, starts, frames, speed limits) -> values and failures of `score_world`, for all worlds."""
+
+    @jax.jit
+    def score(scene: Scene, start: Start, frames: EpisodeFrame, limits: tuple[Array, Array]) -> tuple[dict[str, Array], dict[str, Array]]:
+        score_one = functools.partial(score_world, settings=settings, surrogates=surrogates, mass=mass)
+        values, failures = jax.lax.map(lambda world: score_one(*world), (scene, start, frames, limits), batch_size=WORLDS_AT_ONCE)
+        return values, {name: mask[:recorded_worlds] for name, mask in failures.items()}
+
+    return score
 
 
 def find_speed_limits(scene: Scene) -> tuple[np.ndarray, np.ndarray]:
