@@ -19,6 +19,7 @@ import jax
 import numpy as np
 
 from scenefactory_jax.cli import evaluate, hydra_config
+from scenefactory_jax.core import config as run_config
 from scenefactory_jax.core import markdown, result_file
 from scenefactory_jax.data.loading import scene_source
 from scenefactory_jax.data.packing import agent_table
@@ -84,7 +85,7 @@ def summarise_lists(rows: list[dict[str, Any]]) -> dict[str, Any]:
     """Counts of a list of agents."""
     scenes = {row["scene"] for row in rows}
     with_turn = {row["scene"] for row in rows if row["winding"] is True}
-    routed = [row for row in rows if row["along_lanes"] != ""]
+    routed = [row for row in rows if row["along_lanes"] is not None]
     return {
         "scenes": len(scenes),
         "scenes_with_a_turn": len(with_turn),
@@ -145,7 +146,8 @@ def main() -> None:
     for suite in given.protocols:
         if suite not in SAME_AGENTS:
             rows = list_agents(given.scenes, suite, given.workers)
-            agent_table.write(given.out / f"agents-{suite}-{given.name}.csv", rows)
+            metadata = {"protocol": suite, "versions": run_config.versions()}
+            agent_table.write(given.out / f"agents-{suite}-{given.name}.csv", rows, metadata=metadata)
             result["lists"][suite] = summarise_lists(rows)
         for planner, mu in itertools.product(given.planners, given.mu if suite.startswith("grip") else [None]):
             if planner == RECORDED and suite not in DRIVEN:

@@ -1,4 +1,4 @@
-"""`compare`: learning curves and evaluations of several runs side by side, seeds of one setting together."""
+"""`compare`: learning curves and evaluations of several runs side by side, seeds of one setting together; or two evaluations in pairs."""
 
 import glob
 from collections.abc import Iterable, Mapping
@@ -13,8 +13,9 @@ from scenefactory_jax.core import result_file
 from scenefactory_jax.core.config import flatten
 from scenefactory_jax.core.instantiate import ConfigError
 from scenefactory_jax.evaluation import statistics
-from scenefactory_jax.evaluation.records import read_folder
+from scenefactory_jax.evaluation.records import read_all, read_folder
 from scenefactory_jax.loggers import metrics_csv
+from scenefactory_jax.visualization.report import evaluation_comparison
 from scenefactory_jax.visualization.report import run_comparison as report
 
 STEPS = "steps/total"
@@ -37,13 +38,15 @@ def compare(config: Mapping[str, Any]) -> dict[str, Any]:
     """Compares runs as a config says (`load_config("compare", "runs=[...]")`) and writes the report to `out`.
 
     Returns:
-        Group -> what differs, seeds, curves over agent steps and evaluations, as they were written.
+        Group -> what differs, seeds, curves over agent steps and evaluations, as they were written; of evaluations the report's path.
 
     Raises:
         ConfigError: no such run, a run without metrics, one that is named twice, two of one setting and seed, or a metric that one of them
-            lacks, by name.
+            lacks, by name; see also `compare_evaluations`.
     """
     schema.check(config, schema.Compare)
+    if config["evaluations"]:
+        return {"report": compare_evaluations(config)}
     if not config["metrics"]:
         raise ConfigError(f"metrics: none; give columns of {metrics_csv.FILE}, as events/goal_reached")
     runs = [_read(folder, config["metrics"]) for folder in _find(config["runs"])]
@@ -66,6 +69,31 @@ def compare(config: Mapping[str, Any]) -> dict[str, Any]:
     result_file.write(out / "compare.json", result, digits=DIGITS)
     print(f"{report.table(result)}\n{report.write(out, result)}", flush=True)
     return result
+
+
+def compare_evaluations(config: Mapping[str, Any]) -> Path:
+    """Compares the policies that two folders of `evaluate` have both, and writes the report to `out`: the first less the second.
+
+    Raises:
+        ConfigError: runs too, not two folders, one without an evaluation, or two without a policy in common.
+        RecordsError: two evaluations of different scenes.
+    """
+    folders, out = [Path(folder) for folder in config["evaluations"]], Path(config["out"])
+    if config["runs"] or len(folders) != 2:
+        raise ConfigError(f"evaluations: expected two folders and no runs, got {len(folders)} and {len(config['runs'])} runs")
+    records = [read_all(folder) for folder in folders]
+    if empty := [str(folder) for folder, rows in zip(folders, records, strict=True) if not rows]:
+        raise ConfigError(f"evaluations: {empty[0]} holds no records of agents; give a folder that `evaluate` wrote")
+    labels = [label for label in records[0] if label in records[1]]
+    if not labels:
+        raise ConfigError(f"evaluations: expected a policy that both have, got {', '.join(records[0])} and {', '.join(records[1])}")
+    names = [str(folder) for folder in folders] if folders[0].name == folders[1].name else [folder.name for folder in folders]
+    chosen = {name: {label: rows[label] for label in labels} for name, rows in zip(names, records, strict=True)}
+    out.mkdir(parents=True, exist_ok=True)
+    resampling = {"bootstrap": config["bootstrap"], "seed": config["seed"]}
+    path = evaluation_comparison.write(out, chosen, resampling, command=run_config.format_command("compare"))
+    print(f"{path.read_text(encoding='utf-8')}\nreport {path}", flush=True)
+    return path
 
 
 def _find(patterns: Iterable[str]) -> list[Path]:

@@ -13,17 +13,22 @@ from scenefactory_jax.cli import schema
 from scenefactory_jax.core import config as run_config
 from scenefactory_jax.core import trusted_targets
 from scenefactory_jax.core.config import flatten
+from scenefactory_jax.core.schema import read as read_settings
 from scenefactory_jax.data.loading import scene_source
 from scenefactory_jax.evaluation import protocols
 from scenefactory_jax.evaluation.protocols import Evaluator
 from scenefactory_jax.evaluation.settings import ScoreSettings
 from scenefactory_jax.learning import checkpoint, policy_io
-from scenefactory_jax.visualization.report import evaluation_files, tables
+from scenefactory_jax.visualization.report import evaluation_files, planner_table, tables
 from scenefactory_jax.visualization.report.evaluation_files import Result
+
+ALONE = ("scenes=town",)  # the environment of planners without a run
 
 
 def evaluate(config: Mapping[str, Any]) -> Result:
     """Evaluates a run as a config says (`load_config("evaluate", "run=...")`): deterministic policy, one episode a scene and repeat.
+
+    Without a run, planners alone are evaluated, in the default environment of towns with the protocol's settings.
 
     Raises:
         ConfigError: no such run, no checkpoint in it, a setting that the run does not have, code of others without `trust`.
@@ -31,12 +36,18 @@ def evaluate(config: Mapping[str, Any]) -> Result:
     """
     schema.check_evaluate(config)
     scene_source.use_compilation_cache()
-    run, protocol = policy_io.find(config["run"]), config["protocol"]
+    protocol = config["protocol"]
     overrides = [*configs.list_overrides(protocol["settings"]), *config["overrides"]]
-    trained = configs.apply_overrides(configs.read(run, trust=config["trust"]), overrides)
+    if config["run"] is None:
+        run, trained = None, configs.load_config("train", *ALONE, f"name={protocol['name']}", *overrides)
+        home = Path("runs") / protocol["name"]
+    else:
+        run = policy_io.find(config["run"])
+        trained = configs.apply_overrides(configs.read(run, trust=config["trust"]), overrides)
+        home = Path("runs") / run.name if policy_io.is_bundled(run) else run
     schema.check_mu(trained)
-    out = Path(config["out"] or (Path("runs") / run.name if policy_io.is_bundled(run) else run) / "evaluation")
-    request = {name: config[name] for name in ("overrides", "trust")} | {"run": str(config["run"]), "scenes": config["scenes"]["path"]}
+    out = Path(config["out"] or home / "evaluation")
+    request = {name: config[name] for name in ("run", "overrides", "trust")} | {"scenes": config["scenes"]["path"]}
     request |= {"protocol": protocol["name"], "protocols": protocol["termination"]}
     more = protocol.get("planner_overrides", {})
     words = {name: [*config["planner_overrides"][name], *more.get(name, [])] for name in config["planners"]}
@@ -54,7 +65,7 @@ def evaluate_run(config: Mapping[str, Any], folder: Path) -> Result:
 
 def _evaluate(
     config: Mapping[str, Any],
-    run: Path,
+    run: Path | None,
     out: Path,
     *,
     request: Mapping[str, Any],
@@ -63,25 +74,29 @@ def _evaluate(
 ) -> Result:
     scenes = scene_source.load_heldout_scenes(config["scenes"], path=request["scenes"])
     print(scenes.account, flush=True)
-    policies = {"trained": checkpoint.restore_parameters(run / "checkpoints")}
+    policies = {} if run is None else {"trained": checkpoint.restore_parameters(run / "checkpoints")}
     if settings["untrained"]:
         policies["untrained"] = policy_io.draw_untrained(config, scenes[0])
-    filmed_worlds = settings["video"]["worlds"] if settings["video"]["enable"] else 0
-    recorded_worlds = None if settings["failures"]["pictures"]["enable"] else filmed_worlds
     terminations = load_terminations(request["protocols"])
     scores = settings.get("protocol", {}).get("scores")
-    scores = scores and ScoreSettings(**scores)
+    scores = scores and read_settings(scores, ScoreSettings, where="protocol.scores")
+    shown_worlds = settings["replay_worlds"] if scores else 0
+    filmed_worlds = max(shown_worlds, settings["video"]["worlds"] if settings["video"]["enable"] else 0)
+    recorded_worlds = None if settings["failures"]["pictures"]["enable"] else filmed_worlds
     same = {"scenes": scenes, "terminations": terminations, "settings": settings, "scores": scores}
     run_protocols = functools.partial(protocols.evaluate_protocols, **same)
     evaluated = itertools.chain(
-        run_protocols(config, policies=policies, recorded_worlds=recorded_worlds),
-        *(run_protocols(task, policies={name: {}}, recorded_worlds=0) for name, task in planners.items()),
+        run_protocols(config, policies=policies, recorded_worlds=recorded_worlds) if policies else (),
+        *(run_protocols(task, policies={name: {}}, recorded_worlds=shown_worlds) for name, task in planners.items()),
     )
     result = evaluation_files.write(
         out, evaluated, config=config, run=run, request=request, settings=settings, versions=run_config.versions(),
         command=format_rerun_command(request, settings),
     )  # fmt: skip
-    print(tables.format_summaries(result.summary), f"\nreport {result.report}", sep="\n", flush=True)
+    print(tables.format_summaries(result.summary), flush=True)
+    if planners:
+        print(f"\n{planner_table.format_table(result.summary, result.records)}")
+    print(f"\nreport {result.report}", flush=True)
     return result
 
 
@@ -122,6 +137,8 @@ def format_rerun_command(request: Mapping[str, Any], settings: Mapping[str, Any]
     protocol = {**settings.get("protocol", default["protocol"]), "termination": request["protocols"]}
     given = {name: request[name] for name in ("run", "overrides", "trust")} | {"scenes": {"path": request["scenes"]}}
     given = {**default, **settings, **given, "out": None, "protocol": protocol}
-    values, defaults = flatten({name: given[name] for name in ("run", *default)}), flatten(default)
-    run, *words = [f"{key}={configs.format_value(value)}" for key, value in values.items() if value != defaults.get(key)]
-    return f"python -m scenefactory_jax evaluate {shlex.join([run, *named, *words])}"
+    run = [] if given["run"] is None else [f"run={configs.format_value(given['run'])}"]
+    defaults = flatten(default)
+    values = flatten({name: given[name] for name in default if name != "run"})
+    words = [f"{key}={configs.format_value(value)}" for key, value in values.items() if value != defaults.get(key)]
+    return f"python -m scenefactory_jax evaluate {shlex.join([*run, *named, *words])}"

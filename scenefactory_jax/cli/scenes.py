@@ -10,7 +10,7 @@ import numpy as np
 from scenefactory_jax.cli import hydra_config, scene_operations
 from scenefactory_jax.cli.scene_schema import SceneOperations
 from scenefactory_jax.core import config as run_config
-from scenefactory_jax.core import markdown, schema
+from scenefactory_jax.core import markdown, result_file, schema
 from scenefactory_jax.core.instantiate import ConfigError
 from scenefactory_jax.core.raw_scene import RawScene, SceneError
 from scenefactory_jax.core.safe_names import to_file_name
@@ -48,7 +48,8 @@ def check(config: Mapping[str, Any]) -> scene_source.Scenes:
     if config["out"] is not None:
         _draw(shown[: config["check"]["max_pictures"]], Path(config["out"]), config)
         rows = (row for name, scene in shown for row in agent_table.list_agents(name, scene))
-        agent_table.write(Path(config["out"]) / "agents.csv", rows)
+        metadata = {"config_digest": result_file.digest(config["scenes"]), "versions": run_config.versions()}
+        agent_table.write(Path(config["out"]) / "agents.csv", rows, metadata=metadata)
     return loaded
 
 

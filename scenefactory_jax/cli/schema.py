@@ -70,11 +70,12 @@ class Scenes:
 class Evaluate(Episodes):
     """The command `evaluate`."""
 
-    run: str
+    run: str | None
     trust: bool
     out: str | None
     overrides: list[str]
     untrained: bool
+    replay_worlds: Seed
     planners: list[str]
     planner_overrides: dict[str, list[str]]
     protocol: Protocol
@@ -134,6 +135,7 @@ class Compare:
     """The command `compare`."""
 
     runs: list[str]
+    evaluations: list[str]
     out: str
     metrics: list[str]
     window: Count
@@ -343,6 +345,10 @@ def check_evaluate(config: Mapping[str, Any]) -> None:
     for where, names in {"planners": config["planners"], "protocol.planner_overrides": changed}.items():
         if unknown := [name for name in names if name not in known]:
             raise ConfigError(f"{where}: expected names of {', '.join(known)}, got {unknown[0]!r}")
+    if config["run"] is None and not config["planners"]:
+        raise ConfigError("run: missing; give run=..., or planners=[...] alone, as `evaluate --help` describes it")
+    if config["run"] is None and config["untrained"]:
+        raise ConfigError("untrained: expected false without a run, got true")
 
 
 def check_study(config: Mapping[str, Any]) -> None:

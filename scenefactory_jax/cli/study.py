@@ -18,8 +18,8 @@ import numpy as np
 from scenefactory_jax.cli import study_plan, study_results
 from scenefactory_jax.cli.evaluate import make_training_callback
 from scenefactory_jax.cli.study_plan import Evaluation, Plan, Training
-from scenefactory_jax.core import atomic_file, folder_lock, result_file
 from scenefactory_jax.core import config as run_config
+from scenefactory_jax.core import folder_lock, result_file
 from scenefactory_jax.core.parallel import gpu_processes
 from scenefactory_jax.core.parallel.gpu_processes import TaskClaims
 from scenefactory_jax.data.loading import scene_source
@@ -240,8 +240,9 @@ def _make_evaluation(session: Session, first: Evaluation) -> Callable[[Evaluatio
         else:
             parameters = checkpoint.restore_parameters(training.folder / evaluation.weights)
         records = evaluator(parameters)
-        with atomic_file.write_atomically(evaluation.file) as temporary:
-            write_records(temporary, records)
+        metadata = {"protocol": evaluation.protocol, "policy": evaluation.row, "condition": evaluation.condition}
+        metadata |= {"config_digest": evaluation.program, "versions": run_config.versions()}
+        write_records(evaluation.file, records, metadata=metadata)
         rates = ", ".join(f"{name} {100 * np.mean(records[name]):.1f} %" for name in ("goal_reached", "clean", "collision"))
         print(f"{evaluation.label}: {rates}", flush=True)
 

@@ -43,7 +43,7 @@ def write(plan: Plan, config: Mapping[str, Any], out: Path, *, before: Mapping[s
         return dict(before)
     result = result_file.plain(result, digits=DIGITS)
     out.mkdir(parents=True, exist_ok=True)
-    _write_agents(out, records)
+    _write_agents(out, records, digest=result_file.digest({name: config[name] for name in ("study", "evaluation", "protocol")}))
     result_file.write(out / RESULT, result, digits=DIGITS)
     print(f"{study_report.format_headline(result)}\n\nreport {study_report.write(out, result)}", flush=True)
     return result
@@ -76,16 +76,22 @@ def _read_rows(plan: Plan) -> RowRecords:
     return rows
 
 
-def _write_agents(out: Path, records: RowRecords) -> None:
-    """Writes a table of all agents for each row, condition and protocol, with all seeds of training; earlier tables are removed."""
-    for file in (out / AGENTS).glob("*.csv.xz"):
+def _write_agents(out: Path, records: RowRecords, *, digest: str) -> None:
+    """Writes a table of all agents for each row, condition and protocol, with all seeds of training; earlier tables are removed.
+
+    Args:
+        digest: of the study's config.
+    """
+    for file in [*(out / AGENTS).glob("*.csv.xz"), *(out / AGENTS).glob("*.parquet")]:
         file.unlink()
     for key, runs in records.items():
         if runs:
             (out / AGENTS).mkdir(exist_ok=True)
             seeds = np.concatenate([np.full(len(rows["scene"]), seed) for seed, rows in runs.items()])
             columns = {name: _round(np.concatenate([rows[name] for rows in runs.values()])) for name in next(iter(runs.values()))}
-            write_records(out / _agents_file(key), {"training_seed": seeds, **columns})
+            metadata = dict(zip(("policy", "condition", "protocol"), key, strict=True))
+            metadata |= {"config_digest": digest, "versions": run_config.versions()}
+            write_records(out / _agents_file(key), {"training_seed": seeds, **columns}, metadata=metadata)
 
 
 def _agents_file(key: RowKey) -> str:

@@ -86,11 +86,11 @@ def start_history(
     dt = scene.log.dt
     car_rows = spec.start_row - jnp.round(age / dt).astype(jnp.int32)
     traffic_rows = jnp.round(spec.start_row + (step * control_dt - age) / dt).astype(jnp.int32)
-    cars = _read_rows(scene.log, car_rows, spec.start_row, motion.position[:, :2])
+    cars = _read_rows(scene.log, car_rows, spec.start_row, motion.position[:, :2], dt)
     boxes = scene.traffic
     if boxes.yaw.shape == scene.traffic_log.kind.shape:
         start = spec.start_row + jnp.round(step * control_dt / dt).astype(jnp.int32)
-        others = _read_rows(scene.traffic_log, traffic_rows, start, boxes.position)
+        others = _read_rows(scene.traffic_log, traffic_rows, start, boxes.position, dt)
     else:  # traffic that has other rows than the log
         others = jax.tree.map(lambda leaf: leaf[:, len(motion.yaw) :], repeated)
     logged = jax.tree.map(lambda *parts: jnp.concatenate(parts, axis=1), cars, others)
@@ -99,12 +99,16 @@ def start_history(
     return jax.tree.map(keep, replace(logged, valid=valid), repeated)
 
 
-def _read_rows(log: Any, rows: Int[Array, " K"], start_row: Int[Array, ""] | int, place: Float[Array, "B 2"]) -> History:
-    """Rows of logged tracks; valid where the log is and the road user is at its logged place at `start_row`."""
+def _read_rows(
+    log: Any, rows: Int[Array, " K"], start_row: Int[Array, ""] | int, place: Float[Array, "B 2"], dt: Float[Array, ""]
+) -> History:
+    """Rows of logged tracks; valid where the log is and the road user is at its logged place at `start_row`, or where the row before leads
+    (a perturbed start)."""
     last = log.valid.shape[1] - 1
-    start = jnp.clip(start_row, 0, last)
-    apart = log.position[:, start] - place
-    on_log = log.valid[:, start] & (jnp.sum(apart * apart, axis=-1) < ON_LOG_M**2)
+    start, before = jnp.clip(start_row, 0, last), jnp.clip(start_row - 1, 0, last)
+    is_near = lambda logged: jnp.sum((logged - place) ** 2, axis=-1) < ON_LOG_M**2  # noqa: E731
+    leads = log.position[:, before] + dt * log.velocity[:, before]
+    on_log = log.valid[:, start] & (is_near(log.position[:, start]) | (log.valid[:, before] & is_near(leads)))
     index = jnp.clip(rows, 0, last)
     pick = lambda table: jnp.moveaxis(table[:, index], 1, 0)  # noqa: E731
     valid = pick(log.valid) & ((rows >= 0) & (rows <= last))[:, None] & on_log

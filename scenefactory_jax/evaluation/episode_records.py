@@ -14,7 +14,7 @@ from scenefactory_jax.core.types import SURFACES, Boxes, Scene, State, Weather
 from scenefactory_jax.data.loading import scene_source
 from scenefactory_jax.env import environment
 from scenefactory_jax.env.rollout import RolloutState, rollout, start_rollout
-from scenefactory_jax.evaluation import episodes, failures, route_signals, scoring
+from scenefactory_jax.evaluation import episodes, failures, noisy_start, route_signals, scoring
 from scenefactory_jax.evaluation.failure_signals import FAILURE_EVENTS, Moment, SignalThresholds
 from scenefactory_jax.evaluation.records import Records
 from scenefactory_jax.evaluation.route_signals import CourseThresholds
@@ -32,6 +32,7 @@ class Recording(NamedTuple):
     names: list[str]
     control_hz: float
     goal_radius_m: float
+    failures: dict[str, np.ndarray] | None  # of scored episodes, as `scoring.Scores` has them
 
 
 def make_episode_runner(
@@ -57,22 +58,26 @@ def make_episode_runner(
     keys = jax.random.split(jax.random.key(settings["seed"]), len(index))
     worlds = len(index) if worlds is None else min(worlds, len(index))
     control_hz = float(config["timing"]["control_hz"])
-    score = None if scores is None else scoring.make_scorer(scores, control_dt=1 / control_hz)
+    score = None if scores is None else scoring.make_scorer(scores, config, recorded_worlds=worlds)
+    begun = batch  # the worlds at the start
+    if scores is not None and scores.noise is not None:
+        noise_keys = jax.vmap(jax.random.fold_in, in_axes=(0, None))(keys, 1)
+        begun = noisy_start.perturb_starts(noise_keys, batch, scores.noise, past_rows=scores.past_rows)
     drive = _make_driver(config, settings=settings, recorded_worlds=worlds if score is None else len(index))
 
     def run(parameters):
-        driven = drive(parameters, batch, keys)
+        driven, failing = drive(parameters, begun, keys), None
         first, state, frames = driven.first, driven.last, driven.frames
         records = _make_all_columns(driven.metrics, first, state, driven.distance, names, settings=settings, control_hz=control_hz)
         records |= {name: column[index[records["world"]], records["agent"]] for name, column in scenes.agent_columns.items()}
         if score and frames is not None:
-            values = score(batch, scoring.Start(first.agents, first.motion, driven.first_traffic), frames)
+            values, failing = score(batch, scoring.Start(first.agents, first.motion, driven.first_traffic, begun.log), frames)
             records |= {name: column[records["world"], records["agent"]] for name, column in values.items()}
         if not worlds:
             return records, None
         recorded = jax.tree.map(lambda leaf: leaf[:worlds], frames)
         goal_radius_m = float(config["step_metrics"]["goal_radius_m"])
-        return records, Recording(batch, recorded, state, first.weather, names, control_hz, goal_radius_m)
+        return records, Recording(batch, recorded, state, first.weather, names, control_hz, goal_radius_m, failing)
 
     return run
 

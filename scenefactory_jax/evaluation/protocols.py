@@ -1,5 +1,6 @@
 """Evaluates policies under one or more protocols: records of every agent, and estimates of their metrics while a run trains."""
 
+import dataclasses
 import time
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
@@ -7,7 +8,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from scenefactory_jax.core import result_file
 from scenefactory_jax.data.loading import scene_source
+from scenefactory_jax.env import environment
 from scenefactory_jax.evaluation import episode_records, statistics
 from scenefactory_jax.evaluation.episode_records import Recording, Records
 from scenefactory_jax.evaluation.settings import ScoreSettings
@@ -23,6 +26,7 @@ class Evaluated(NamedTuple):
     policy: str
     records: Records
     recording: Recording | None
+    digest: str  # of what decides the episodes, but for scenes and weights
 
     @property
     def label(self) -> str:
@@ -54,8 +58,10 @@ def evaluate_protocols(
         worlds = recorded_worlds if number == 0 or recorded_worlds is None else 0
         task = {**config, "termination": termination}
         run = episode_records.make_episode_runner(task, scenes, settings=settings, worlds=worlds, scores=scores)
+        parts = {name: task[name] for name in (*environment.GROUPS, "policy")} | {"pack": task["scenes"]["pack"]}
+        parts |= {"seed": settings["seed"], "repeats": settings["repeats"], "scores": scores and dataclasses.asdict(scores)}
         for policy, parameters in policies.items():
-            yield Evaluated(protocol, policy, *run(parameters))
+            yield Evaluated(protocol, policy, *run(parameters), result_file.digest(parts))
 
 
 def make_evaluator(config: Mapping[str, Any], scenes: scene_source.Scenes, *, settings: Mapping[str, Any]) -> Evaluator:

@@ -1,19 +1,18 @@
 """Records of an evaluation: one row for every spawned agent and episode, in memory and as files."""
 
 import csv
-import lzma
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from scenefactory_jax.core import result_file
+from scenefactory_jax.core import column_table, result_file
 
 Records = Mapping[str, np.ndarray]  # column -> one value for every agent
 RESULT = "evaluation.json"  # settings of the evaluation, beside the records
-FILES = (RESULT, "agents-*.csv", "comparison-*.png", "failures.json", "failures-*", "learning.png", "outcomes.png", "safety.png")
-FILES += ("trajectories.png", "video.gif", "video.mp4", "report.md")  # of an evaluation's folder
+FILES = (RESULT, "agents-*.csv", "agents-*.parquet", "comparison-*.png", "failures.json", "failures-*", "learning.png", "outcomes.png")
+FILES += ("planners.*", "replay-*.html", "safety.png", "trajectories.png", "video.gif", "video.mp4", "report.md")  # of an evaluation
 ROUTE_EVENTS = ("red_light", "stop_sign", "off_route")  # records of before routes lack them: no agent had such an event
 EVENTS = ("numerical_error", "goal_reached", "collision", "out_of_bounds", "road_edge_contact", *ROUTE_EVENTS)
 COLUMNS: dict[str, type] = {  # further columns are kept and may serve a breakdown
@@ -47,25 +46,26 @@ def select_rows(records: Records, rows: np.ndarray) -> dict[str, np.ndarray]:
     return {name: np.asarray(column)[rows] for name, column in records.items()}
 
 
-def write_records(path: Path, records: Records) -> None:
-    """Writes records as CSV (`.csv` or `.csv.xz`), one row for every agent; each number reads back to the same value."""
+def write_records(path: Path, records: Records, *, metadata: Mapping[str, Any]) -> None:
+    """Writes records as `column_table.write` does, one row for every agent.
+
+    Args:
+        metadata: protocol, digest of the config and versions, or what else says how the records came about.
+    """
     check_records(records)
-    columns = [np.asarray(column).tolist() for column in records.values()]
-    with _open_csv(path, "wt") as file:
-        writer = csv.writer(file)
-        writer.writerow(records)
-        writer.writerows(zip(*columns, strict=True))
+    column_table.write(path, {name: np.asarray(column) for name, column in records.items()}, metadata=metadata)
 
 
 def read_records(path: Path) -> dict[str, np.ndarray]:
-    """Reads records that `write_records` wrote. Columns outside `COLUMNS` become int, float, bool or str: the first that fits all cells.
+    """Reads the CSV that `write_records` wrote. Columns outside `COLUMNS` become int, float, bool or str: the first that fits all cells; an
+    empty cell of floats is NaN.
 
     Raises:
         RecordsError: no such file, no rows, a ragged row, or a cell that does not fit its column.
     """
     if not path.is_file():
         raise RecordsError(f"{path}: file not found; expected the CSV of an evaluation")
-    with _open_csv(path, "rt") as file:
+    with column_table.open_csv(path, "rt", compressed=path.suffix == ".xz") as file:
         names, *rows = list(csv.reader(file)) or [[]]
     for number, row in enumerate(rows, start=2):
         if len(row) != len(names):
@@ -83,17 +83,12 @@ def read_records(path: Path) -> dict[str, np.ndarray]:
     return records
 
 
-def _open_csv(path: Path, mode: str) -> Any:
-    """Opens a text file with line ends as they are written; `.xz` is compressed, the same content always to the same bytes."""
-    return (lzma.open if path.suffix == ".xz" else open)(path, mode, newline="", encoding="utf-8")
-
-
 def _parse(cells: list[str], kind: type) -> np.ndarray | None:
     """The cells as one type; None: one does not fit."""
     if kind is bool:
         return np.array([cell == "True" for cell in cells]) if all(cell in ("True", "False") for cell in cells) else None
     try:
-        return np.array([kind(cell) for cell in cells], dtype=kind)
+        return np.array([kind(cell or np.nan) if kind is float else kind(cell) for cell in cells], dtype=kind)
     except ValueError:
         return None
 
@@ -110,7 +105,17 @@ def read_settings(folder: Path) -> dict[str, Any]:
     return result_file.read(folder / RESULT) if (folder / RESULT).is_file() else {"scenes": None, "overrides": []}
 
 
+def name_file(label: str) -> str:
+    """Returns the name of the CSV of a label: "strict", or "strict, untrained" of another policy than the trained one."""
+    return f"agents-{label.replace(', ', '-')}.csv"
+
+
+def read_all(folder: Path) -> dict[str, dict[str, np.ndarray]]:
+    """Reads the records of all policies from an evaluation's folder, by label; empty: it has none."""
+    return {path.stem.removeprefix("agents-").replace("-", ", "): read_records(path) for path in sorted(folder.glob("agents-*.csv"))}
+
+
 def read_folder(folder: Path) -> dict[str, dict[str, np.ndarray]]:
     """Reads the records of the trained policy from an evaluation's folder, by protocol; empty: it has none."""
-    files = {path.stem.removeprefix("agents-"): path for path in sorted(folder.glob("agents-*.csv"))}
-    return {name: read_records(path) for name, path in files.items() if "-" not in name}  # others: PROTOCOL-POLICY
+    paths = (path for path in sorted(folder.glob("agents-*.csv")) if path.stem.count("-") == 1)
+    return {path.stem.removeprefix("agents-"): read_records(path) for path in paths}

@@ -4,23 +4,27 @@ States are a tenth of a second apart, as the published metrics want them. The pa
 rows of the log before the start (`scenes.pack.log_from: start`); without, an episode begins with the state at its start.
 """
 
+import dataclasses
 import functools
-from collections.abc import Callable
-from typing import NamedTuple
+from collections.abc import Callable, Mapping
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
+from scenefactory_jax.core import schema
 from scenefactory_jax.core.pytree import replace
 from scenefactory_jax.core.schema import ConfigError
 from scenefactory_jax.core.track_interpolation import interpolate_track
 from scenefactory_jax.core.types import DRIVABLE, ROUTE_SPACING_M, AgentLog, Agents, Boxes, Motion, Scene, TrafficLog
+from scenefactory_jax.env.step_metrics import StepMetricsConfig
 from scenefactory_jax.evaluation.episodes import EpisodeFrame
 from scenefactory_jax.evaluation.metrics import episode_metrics, episode_scores
 from scenefactory_jax.evaluation.metrics.episode_record import EpisodeRecord, Lanes, Lights, Others, Track, leave_out
 from scenefactory_jax.evaluation.metrics.episode_steps import StepMetrics, measure_steps
+from scenefactory_jax.evaluation.metrics.step_failures import find_failures
 from scenefactory_jax.evaluation.metrics.waymax_steps import Paths
 from scenefactory_jax.evaluation.settings import ScoreSettings
 from scenefactory_jax.roadgraph.lane_crossings import find_intersection_segments
@@ -29,6 +33,8 @@ from scenefactory_jax.roadgraph.traffic_lights import read_light_states
 
 STEP_S = 0.1  # between states
 EVEN_S = 1e-3  # by which a time step may differ
+COUNTED = "counted"  # whether a state counts, beside the failures of metrics
+AT_START_M = 0.01  # a car this near to its start began there
 PATHS = 10  # of an agent that are read, its best ones
 WORLDS_AT_ONCE = 4  # on the device; memory grows with them
 
@@ -39,29 +45,44 @@ class Start(NamedTuple):
     agents: Agents
     motion: Motion
     traffic: Boxes
+    past: AgentLog  # of the agents: rows before the start
 
 
-def make_scorer(settings: ScoreSettings, *, control_dt: float) -> Callable[[Scene, Start, EpisodeFrame], dict[str, np.ndarray]]:
-    """Makes a function (scenes, starts, frames) -> metric -> values `[W, A]`, NaN where a metric cannot be computed.
+class Scores(NamedTuple):
+    """Scores of all worlds, on the host."""
+
+    values: dict[str, np.ndarray]  # metric -> [W, A], NaN where it cannot be computed
+    failures: dict[str, np.ndarray]  # metric -> whether it fails after each control step, [W, T, A], of the recorded worlds; and COUNTED
+
+
+def make_scorer(
+    settings: ScoreSettings, config: Mapping[str, Any], *, recorded_worlds: int
+) -> Callable[[Scene, Start, EpisodeFrame], Scores]:
+    """Makes a function (scenes, starts, frames) -> scores.
 
     All arguments have a leading axis of worlds; frames have the control steps behind it.
+
+    Args:
+        config: groups `timing`, `step_metrics` and `dynamics` of the environment.
+        recorded_worlds: the first worlds, whose failures in time are returned.
 
     Raises:
         ConfigError: control steps of which a tenth of a second is no multiple.
     """
-    stride = round(STEP_S / control_dt)
-    if stride < 1 or abs(stride * control_dt - STEP_S) > 1e-6:
-        raise ConfigError(f"timing.control_hz: expected a multiple of {1 / STEP_S:g} for scores, got {1 / control_dt:g}")
+    control_hz, mass = float(config["timing"]["control_hz"]), float(config["dynamics"]["contact"]["mass"])
+    stride, surrogates = round(STEP_S * control_hz), schema.read(config["step_metrics"], StepMetricsConfig, where="step_metrics")
+    if stride < 1 or abs(stride / control_hz - STEP_S) > 1e-6:
+        raise ConfigError(f"timing.control_hz: expected a multiple of {1 / STEP_S:g} for scores, got {control_hz:g}")
+    score = make_program(dataclasses.replace(settings, noise=None), surrogates, mass, recorded_worlds)
 
-    @jax.jit
-    def score(scene: Scene, start: Start, frames: EpisodeFrame, lane_facts: LaneFacts) -> dict[str, Array]:
-        score_one = functools.partial(score_world, settings=settings)
-        return jax.lax.map(lambda world: score_one(*world), (scene, start, frames, lane_facts), batch_size=WORLDS_AT_ONCE)
-
-    def score_all(scene: Scene, start: Start, frames: EpisodeFrame) -> dict[str, np.ndarray]:
+    def score_all(scene: Scene, start: Start, frames: EpisodeFrame) -> Scores:
         thinned = jax.tree.map(lambda leaf: leaf[:, stride - 1 :: stride], frames)
         worlds = replace(scene, road_grid=None)
-        return jax.device_get(score(worlds, start, thinned, describe_lanes(scene)))
+        values, failures = jax.device_get(score(worlds, start, thinned, describe_lanes(scene)))
+        step = np.arange(frames.active.shape[1])
+        held = np.maximum(step - (stride - 1), 0) // stride  # a failure lasts from its state until the next one
+        marks = {name: mask[:, held] & (step >= stride - 1)[:, None] for name, mask in failures.items()}
+        return Scores(values, marks | {COUNTED: failures[COUNTED][:, step // stride]})
 
     return score_all
 
@@ -84,6 +105,19 @@ def describe_lanes(scene: Scene) -> LaneFacts:
     return LaneFacts(*jax.device_put((*find_speed_limits(scene), np.stack(inside))))
 
 
+@functools.lru_cache(maxsize=4)  # all planners of an evaluation have one program
+def make_program(settings: ScoreSettings, surrogates: StepMetricsConfig, mass: float, recorded_worlds: int) -> Callable[..., Any]:
+    """Makes the compiled function (scenes, starts, frames, lanes' facts) -> values and failures of `score_world`, for all worlds."""
+
+    @jax.jit
+    def score(scene: Scene, start: Start, frames: EpisodeFrame, facts: LaneFacts) -> tuple[dict[str, Array], dict[str, Array]]:
+        score_one = functools.partial(score_world, settings=settings, surrogates=surrogates, mass=mass)
+        values, failures = jax.lax.map(lambda world: score_one(*world), (scene, start, frames, facts), batch_size=WORLDS_AT_ONCE)
+        return values, {name: mask[:recorded_worlds] for name, mask in failures.items()}
+
+    return score
+
+
 def find_speed_limits(scene: Scene) -> tuple[np.ndarray, np.ndarray]:
     """Finds the speed limit of each lane segment of batched scenes, from the routes that lead along it: limits and whether one is known."""
     lane, routes = np.asarray(scene.lanes.polyline), jax.device_get(scene.routes)
@@ -98,9 +132,20 @@ def find_speed_limits(scene: Scene) -> tuple[np.ndarray, np.ndarray]:
 
 
 def score_world(
-    scene: Scene, start: Start, frames: EpisodeFrame, lane_facts: LaneFacts, *, settings: ScoreSettings
-) -> dict[str, Float[Array, " A"]]:
-    """Computes the metrics and scores of all agents of one world; NaN where one cannot be computed."""
+    scene: Scene,
+    start: Start,
+    frames: EpisodeFrame,
+    lane_facts: LaneFacts,
+    *,
+    settings: ScoreSettings,
+    surrogates: StepMetricsConfig,
+    mass: float,
+) -> tuple[dict[str, Float[Array, " A"]], dict[str, Bool[Array, "T A"]]]:
+    """Computes the metrics and scores of all agents of one world, NaN where one cannot be computed; and where metrics fail in its frames.
+
+    Args:
+        mass: of the agents' cars, kg.
+    """
     past_rows = settings.past_rows
     users, log = collect_users(scene, start, frames, past_rows=past_rows), read_log(scene, past_rows, len(frames.active))
     lanes, edges = list_lane_points(scene, lane_facts), list_edge_points(scene.edges)
@@ -108,8 +153,9 @@ def score_world(
     lights = Lights(scene.controls.lane, jax.vmap(lambda at: read_light_states(scene.controls, at))(time))
     counted = jnp.arange(users.yaw.shape[1]) > past_rows
     use = jnp.pad(frames.friction_utilization, ((past_rows + 1, 0), (0, 0)))
+    masses = find_masses(start, own=mass, vehicle_kg_per_m2=settings.vehicle_kg_per_m2)
 
-    def score_agent(agent: Int[Array, ""]) -> dict[str, Array]:
+    def score_agent(agent: Int[Array, ""]) -> tuple[dict[str, Array], dict[str, Array]]:
         record = EpisodeRecord(
             ego=Track(*(leaf[agent] for leaf in users[:4])),
             size=users.size[agent],
@@ -121,14 +167,26 @@ def score_world(
             lights=lights,
             log=jax.tree.map(lambda leaf: leaf[agent], log),
             friction_utilization=use[:, agent],
+            mass=masses[agent],
+            other_mass=masses,
         )
-        steps = measure_steps(record, dt=STEP_S)
+        steps = measure_steps(record, dt=STEP_S, surrogates=surrogates)
         record = record._replace(counted=cut_at_failure(record, steps)) if settings.ends_at_failure else record
         metrics = episode_metrics.collect_metrics(record, steps, dt=STEP_S)
+        failures = find_failures(record, steps, metrics, dt=STEP_S) | {COUNTED: record.counted}
         values = metrics | episode_scores.compute_scores(metrics)
-        return {name: jnp.where(valid, value, jnp.nan) for name, (value, valid) in values.items()}
+        values = {name: jnp.where(valid, value, jnp.nan) for name, (value, valid) in values.items()}
+        return values, {name: mask[past_rows + 1 :] for name, mask in failures.items()}
 
-    return jax.vmap(score_agent)(jnp.arange(len(start.agents.yaw)))
+    return jax.vmap(score_agent, out_axes=(0, 1))(jnp.arange(len(start.agents.yaw)))
+
+
+def find_masses(start: Start, *, own: float, vehicle_kg_per_m2: float) -> Float[Array, " U"]:
+    """Finds the masses of agents and traffic, kg: of the agents' car; of traffic that can be moved its own (`traffic.mass_kg`); of
+    vehicles, which nothing moves, that of a car with their length x width."""
+    boxes = start.traffic
+    immovable = vehicle_kg_per_m2 * boxes.size[:, 0] * boxes.size[:, 1]
+    return jnp.concatenate([jnp.full(len(start.agents.yaw), own), jnp.where(jnp.isinf(boxes.mass), immovable, boxes.mass)])
 
 
 def cut_at_failure(record: EpisodeRecord, steps: StepMetrics) -> Bool[Array, " T"]:
@@ -142,7 +200,10 @@ def collect_users(scene: Scene, start: Start, frames: EpisodeFrame, *, past_rows
     """Joins the logged past, the start and the frames of agents and traffic."""
     motion, boxes, traffic = start.motion, start.traffic, frames.traffic
     at_start = (motion.position[:, :2], motion.yaw, motion.velocity[:, :2], start.agents.present)
-    own = _join(_read_past(scene, scene.log, past_rows), at_start, (frames.position, frames.yaw, frames.velocity, frames.active))
+    begun = jnp.sum((start.agents.position - motion.position[:, :2]) ** 2, axis=-1) < AT_START_M**2  # what plays its log back is on it
+    choose = lambda new, old: jnp.where(begun.reshape(-1, *[1] * (new.ndim - 1)), new, old)  # noqa: E731
+    past = jax.tree.map(choose, _read_past(scene, start.past, past_rows), _read_past(scene, scene.log, past_rows))
+    own = _join(past, at_start, (frames.position, frames.yaw, frames.velocity, frames.active))
     follows_log = len(scene.traffic_log.kind) == len(boxes.yaw)  # without traffic there are no boxes
     past = _read_past(scene, scene.traffic_log if follows_log else None, past_rows, len(boxes.yaw))
     at_start = (boxes.position, boxes.yaw, boxes.velocity, boxes.present)

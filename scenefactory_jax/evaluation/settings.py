@@ -4,7 +4,7 @@ import importlib.util
 from dataclasses import dataclass
 from typing import Annotated, Literal
 
-from scenefactory_jax.core.schema import Bounds, ConfigError, Count, NonNegative, Seed
+from scenefactory_jax.core.schema import Bounds, ConfigError, Count, Fraction, NonNegative, Positive, Seed
 from scenefactory_jax.evaluation.failure_signals import SignalThresholds
 from scenefactory_jax.evaluation.failures import TypeThresholds
 from scenefactory_jax.evaluation.route_signals import CourseThresholds
@@ -64,8 +64,22 @@ class Episodes:
 
 
 @dataclass(frozen=True)
+class NoisyStart:
+    """The random held action of the second before a start (`evaluation.noisy_start`)."""
+
+    acceleration_mps2: Positive  # bound of either sign
+    curvature_radpm: tuple[Positive, Positive]  # bounds of either sign, of a car that stands and from `fast_mps` on; linear between
+    fast_mps: Positive
+    strong_fraction: Fraction  # probability of a strong action
+    strong_from: Fraction  # of the bounds, of a strong action
+    redraws: Seed  # while the car fails
+
+
+@dataclass(frozen=True)
 class ScoreSettings:
     """How episodes are scored (`evaluation.scoring`)."""
 
     past_rows: Seed  # rows of the log before the start: with scenes.pack.log_from=start
     ends_at_failure: bool  # only states up to the first overlap, off-road state or red light count, as in V-Max's evaluation
+    vehicle_kg_per_m2: Positive  # mass of a vehicle of the traffic over its length x width, for delta-v
+    noise: NoisyStart | None = None  # before the start; null: as recorded

@@ -28,7 +28,7 @@ def run(folder, *, seed, dtype="float32", goal_reached=(0.0, 0.2, 0.4, 0.6), age
             row = {"iteration": i, "minutes": 0.5 * i, "steps/total": 100 * i, "casps": 1000.0 + seed}
             writer.writerow(row | {"events/goal_reached": share, "reward": seed})
     if agents is not None:
-        write_records(folder / "agents-strict.csv", agents)
+        write_records(folder / "agents-strict.csv", agents, metadata={})
     return folder
 
 

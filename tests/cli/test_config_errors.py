@@ -125,7 +125,9 @@ def test_a_name_leads_nowhere_and_can_be_printed(tmp_path, capsys):
     written(folder, document(name="\ud800half"), "b.json")  # half a surrogate pair
     loaded = scenes(hydra_config.load_config("scenes", "scenes=womd", f"scenes.path={folder}", "op=check", f"out={tmp_path / 'out'}"))
     assert len(loaded) == 2 and "\\ud800half" in capsys.readouterr().out
-    assert {path.name for path in (tmp_path / "out").iterdir()} == {".._escaped.png", "_ud800half.png", "agents.csv", "sheet.png"}
+    assert {path.name for path in (tmp_path / "out").iterdir()} == {
+        ".._escaped.png", "_ud800half.png", "agents.csv", "agents.parquet", "sheet.png"
+    }  # fmt: skip
     assert sorted(path.name for path in tmp_path.iterdir()) == ["in", "out"]
     summary = convert(hydra_config.load_config("convert", f"source={folder}", f"out={tmp_path / 'bank'}", *HERE))
     assert [reject["scene"] for reject in summary.rejects] == ["\ud800half"]  # Arrow holds no half pair

@@ -67,7 +67,7 @@ def test_help_is_the_config_with_its_comments():
     told = {"devices: null # that share the worlds; null: all there are", "worlds: 7", "# weather=ice; or "}
     assert all(any(line.startswith(one) for line in text.splitlines()) for one in told)
     assert max(map(len, text.splitlines())) <= annotated_config.WIDTH
-    assert "run: ??? # folder that `train` or `export` wrote" in annotated_config.annotate("evaluate")
+    assert "run: null # folder that `train` or `export` wrote" in annotated_config.annotate("evaluate")
 
 
 def test_an_empty_mapping_empties_what_is_removed_first():

@@ -528,7 +528,7 @@ def test_a_wrong_value_ends_as_one_line():
     [
         (["train", "worlds=many"], "error: worlds: expected an integer >= 1, got 'many'"),
         (["train", "scenes.path=/nowhere", "experiment=smoke"], "error: /nowhere: no such file or folder"),
-        (["evaluate"], "error: run: missing; give run=..., as `evaluate --help` describes it"),
+        (["evaluate"], "error: run: missing; give run=..., or planners=[...] alone, as `evaluate --help` describes it"),
         (["train", "seed"], "error: seed: expected seed=VALUE, or ~seed to remove it"),
         (["train", "reward={}"], "error: reward={}: mappings are merged, so an empty one changes nothing; to empty it: ~reward +reward={}"),
         (["train", "--foo"], "error: unrecognized arguments: --foo; --hydra-help describes the flags"),
@@ -639,7 +639,7 @@ RUNS = (
 
 
 SUITES = ("recorded_routes", "route100", "conflict", "conflict_reactive", "grip", "grip_hidden", "grip_stops")  # with routes
-SUITES += ("vmax", "nuplan", "nuplan_reactive")
+SUITES += ("vmax", "vmax_noise", "nuplan", "nuplan_reactive")
 
 
 @pytest.mark.parametrize("name", names("protocol"))

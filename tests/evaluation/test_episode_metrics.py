@@ -9,8 +9,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from scenefactory_jax.cli.hydra_config import load_config
+from scenefactory_jax.core import schema
 from scenefactory_jax.core.types import LANE_STREET
-from scenefactory_jax.evaluation.metrics import episode_metrics, nuplan_steps
+from scenefactory_jax.env.step_metrics import StepMetricsConfig
+from scenefactory_jax.evaluation.metrics import episode_metrics, nuplan_steps, step_failures
 from scenefactory_jax.evaluation.metrics.episode_metrics import compute_episode_metrics
 from scenefactory_jax.evaluation.metrics.episode_record import (
     CYCLIST,
@@ -32,6 +35,7 @@ from scenefactory_jax.roadgraph.signed_edge_distance import EdgePoints
 STEPS, DT, POINTS = 41, 0.1, 141
 TIME = DT * (np.arange(STEPS) - 10)  # the first 10 states are the past
 LANE = 7
+SURROGATES = schema.read(load_config("task")["step_metrics"], StepMetricsConfig)
 
 
 def drive(speed=10.0, *, x=0.0, y=0.0, yaw=0.0, along=None):
@@ -90,14 +94,19 @@ def make_record(ego, users=(), *, log=None, **parts):
 
 @jax.jit
 def compute(record, as_published):
-    metrics = compute_episode_metrics(record, dt=DT, as_published=as_published)
-    return metrics | compute_scores(metrics)
+    steps = measure_steps(record, dt=DT, surrogates=SURROGATES, as_published=as_published)
+    metrics = episode_metrics.collect_metrics(record, steps, dt=DT, as_published=as_published)
+    return metrics | compute_scores(metrics), step_failures.find_failures(record, steps, metrics, dt=DT)
 
 
 def judge(*arguments, as_published=False, **parts):
-    """Values of the metrics that are valid."""
-    found = jax.device_get(compute(make_record(*arguments, **parts), jnp.bool_(as_published)))
-    return {name: float(value) for name, (value, valid) in found.items() if valid}
+    """Values of the metrics that are valid; each metric that fails does so in some state, and no other one does."""
+    found, failures = jax.device_get(compute(make_record(*arguments, **parts), jnp.bool_(as_published)))
+    values = {name: float(value) for name, (value, valid) in found.items() if valid}
+    failed = {name for name in step_failures.EVENTS if values.get(name, 0) > 0}
+    failed |= {name for name in step_failures.COMPLIANCE if values.get(name, 1) < 1}
+    assert {name for name, mask in failures.items() if mask.any()} == failed
+    return values
 
 
 CAR, CONE = (4.0, 2.0), (0.5, 0.5)
@@ -229,11 +238,12 @@ def test_comfort_parts():
     yaw = jnp.asarray(0.4 * TIME, jnp.float32)
     velocity = 8.0 * jnp.stack([jnp.cos(yaw), jnp.sin(yaw)], axis=1)
     compute_comfort = jax.jit(nuplan_steps.compute_comfort, static_argnames="dt")
+    extremes = lambda comfort: [(min if name == "lowest" else max)(part[10:]) for name, part in comfort._asdict().items()]  # noqa: E731
     circle = compute_comfort(velocity, jnp.mod(yaw + 3.0, 2 * jnp.pi) - 3.0, first, last, dt=DT)
-    np.testing.assert_allclose(circle, [0, 0, 3.2, 0.4, 0, 0, 0], atol=0.1)
+    np.testing.assert_allclose(extremes(circle), [0, 0, 3.2, 0.4, 0, 0, 0], atol=0.1)
     velocity = jnp.stack([5.0 + jnp.asarray(TIME) ** 2, jnp.zeros(STEPS)], axis=1).astype(jnp.float32)
     ramp = compute_comfort(velocity, jnp.zeros(STEPS), first, last, dt=DT)
-    np.testing.assert_allclose(ramp, [0.1, 5.95, 0, 0, 0, 2.0, 2.0], atol=0.15)
+    np.testing.assert_allclose(extremes(ramp), [0.1, 5.95, 0, 0, 0, 2.0, 2.0], atol=0.15)
 
 
 @pytest.mark.parametrize(("acceleration", "comfortable"), [(2.2, 1), (2.6, 0), (-3.8, 1), (-4.3, 0)])
@@ -322,10 +332,17 @@ def test_missing_parts():
 
 def test_no_friction_and_no_masses():
     record = make_record(drive(), [(VEHICLE, drive(6.0, x=8.0), CAR)], friction_utilization=None, mass=None, other_mass=None)
-    steps = jax.tree.map(lambda leaf: jnp.ones(leaf.shape, leaf.dtype), jax.eval_shape(lambda one: measure_steps(one, dt=DT), record))
+    shapes = jax.eval_shape(lambda one: measure_steps(one, dt=DT, surrogates=SURROGATES), record)
+    steps = jax.tree.map(lambda leaf: jnp.ones(leaf.shape, leaf.dtype), shapes)
+    assert jax.eval_shape(lambda one: compute_episode_metrics(one, dt=DT), record).keys() > {"nuplan_comfort", "min_circles_ttc_s"}
     found = jax.jit(episode_metrics._collect_safety)(record, steps)
     valid = {name for name, (_, known) in found.items() if known}
     assert found.keys() - valid == {"delta_v_mps", "mean_friction_utilization", "max_friction_utilization"}
+    plain = jax.eval_shape(lambda one: measure_steps(one, dt=DT), record)
+    apart = {name: jnp.full(steps.drac.shape, value) for name, value in (("drac", jnp.nan), ("circles_ttc_s", jnp.inf))}
+    assert jax.tree.structure(plain) == jax.tree.structure(steps)
+    found = jax.jit(episode_metrics._collect_safety)(record, steps._replace(**apart))  # without circles
+    assert not found["max_drac"][1] and not found["min_circles_ttc_s"][1]
 
 
 def test_a_car_is_left_out_of_the_road_users():

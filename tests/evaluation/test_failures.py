@@ -211,7 +211,7 @@ def test_the_worst_come_first(played):
 
 def test_records_keep_failure_types_in_a_file(played, tmp_path):
     records, _ = played
-    write_records(tmp_path / "agents.csv", records)
+    write_records(tmp_path / "agents.csv", records, metadata={})
     again = read_records(tmp_path / "agents.csv")
     assert failures.rank_failures(again) == failures.rank_failures(records)
     told = json.loads(failure_pictures.write(tmp_path, {"strict": records}, {}).read_text())["strict"]["types"]

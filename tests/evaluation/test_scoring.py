@@ -14,10 +14,11 @@ from support.running import SHARED
 
 from scenefactory_jax.cli import hydra_config
 from scenefactory_jax.cli.evaluate import evaluate
+from scenefactory_jax.cli.hydra_config import load_config
 from scenefactory_jax.core.pytree import replace, unchecked
 from scenefactory_jax.core.schema import ConfigError
 from scenefactory_jax.core.track_interpolation import make_empty_boxes
-from scenefactory_jax.core.types import EDGE_BOUNDARY, LANE_STREET, AgentLog, Motion
+from scenefactory_jax.core.types import EDGE_BOUNDARY, LANE_STREET, AgentLog, Boxes, Motion
 from scenefactory_jax.evaluation import scoring
 from scenefactory_jax.evaluation.episodes import EpisodeFrame, TrafficFrame
 from scenefactory_jax.evaluation.settings import ScoreSettings
@@ -60,7 +61,7 @@ def episode():
     still = dict.fromkeys((field.name for field in dataclasses.fields(Motion)), jnp.zeros(2))
     places = {"position": jnp.array([[0.0, 0.0, 0.5], [WALL_M, 0.0, 0.5]]), "velocity": jnp.array([[SPEED, 0, 0], [0.0, 0, 0]])}
     motion = Motion(**{**still, **places})
-    return scene, scoring.Start(scene.agents, motion, make_empty_boxes()), frames
+    return scene, scoring.Start(scene.agents, motion, make_empty_boxes(), scene.log), frames
 
 
 def test_states_are_past_start_and_every_tenth_of_a_second():
@@ -75,15 +76,19 @@ def test_states_are_past_start_and_every_tenth_of_a_second():
     np.testing.assert_array_equal(np.asarray(log.velocity)[0, 4], [SPEED, 0.0])  # also in the last row of a log
 
 
+def settings(**changed):
+    return ScoreSettings(**{"past_rows": PAST, "ends_at_failure": True, "vehicle_kg_per_m2": 200.0} | changed)
+
+
 @functools.cache
 def scores():
     one = jax.tree.map(lambda leaf: jnp.asarray(leaf)[None], episode())
-    found = scoring.make_scorer(ScoreSettings(past_rows=PAST, ends_at_failure=True), control_dt=1 / HZ)(*one)
-    return {name: values[0] for name, values in found.items()}
+    found = scoring.make_scorer(settings(), load_config("task"), recorded_worlds=1)(*one)
+    return {name: values[0] for name, values in found.values.items()}, {name: mask[0] for name, mask in found.failures.items()}
 
 
 def test_a_car_that_hits_one_that_stands_is_at_fault():
-    found = scores()
+    found, _ = scores()
     assert found["overlap"].tolist() == [1, 1]
     assert found["at_fault_collision"].tolist() == [1, 0]
     assert found["accuracy"].tolist() == [0, 0]
@@ -94,9 +99,31 @@ def test_a_car_that_hits_one_that_stands_is_at_fault():
     assert found["nuplan_speed_compliance"][0] == 1  # 8 m/s where 10 are allowed
 
 
+def test_failures_are_marked_from_the_state_in_which_they_happen():
+    """The overlap of the state 2.1 s after the start is marked in control step 62, its last; later states do not count."""
+    _, failures = scores()
+    overlap = round((WALL_M - LENGTH_M) / SPEED * 10 + 1) * HZ // 10 - 1
+    for name in ("overlap", "at_fault_collision"):
+        assert np.flatnonzero(failures[name][:, 0]).tolist() == list(range(overlap, overlap + HZ // 10)), name
+    assert not failures["at_fault_collision"][:, 1].any() and failures["overlap"][:, 1].any()
+    assert np.flatnonzero(failures[scoring.COUNTED][:, 0])[[0, -1]].tolist() == [0, overlap]
+    ttc = np.flatnonzero(failures["ttc_within_bound"][:, 0])[0]
+    assert SPEED * (ttc + 1) / HZ == pytest.approx(WALL_M - LENGTH_M - 0.95 * SPEED, abs=0.1 * SPEED)
+    assert not failures["off_road"].any()
+
+
+def test_road_users_have_masses():
+    start = episode()[1]
+    assert scores()[0]["delta_v_mps"][0] == SPEED / 2  # between two equal cars
+    parts = dict.fromkeys((field.name for field in dataclasses.fields(Boxes)), jnp.zeros(2))
+    boxes = unchecked(Boxes, **parts | {"size": jnp.array([[5.0, 2.0], [0.5, 0.5]]), "mass": jnp.array([jnp.inf, 80.0])})
+    found = scoring.find_masses(start._replace(traffic=boxes), own=1980.0, vehicle_kg_per_m2=200.0)
+    assert found.tolist() == [1980.0, 1980.0, 2000.0, 80.0]
+
+
 def test_an_episode_ends_at_its_failure():
     """The rectangles overlap once the car has driven 16 m, at a state 2.1 s after the start; the standing car's episode ends there, too."""
-    found = scores()
+    found, _ = scores()
     x = SPEED * 0.1 * np.arange(1, round(10 * (WALL_M - LENGTH_M) / SPEED + 1) + 1)
     log_end, lateral = SPEED * 0.1 * 2, 4.0  # metres; MetaDrive: farther from the recorded way is out of road
     assert found["cost"][0] == np.sum(x > log_end + lateral + 1e-3) + 1  # and one state in contact
@@ -104,7 +131,7 @@ def test_an_episode_ends_at_its_failure():
 
 
 def test_what_a_scene_lacks_has_no_value():
-    found = scores()
+    found, _ = scores()
     assert np.isnan(found["red_light_run"]).all()  # no lights
     assert np.isnan(found["progress_ratio"][1])  # a log that stands
     assert np.isfinite(found["off_road"]).all()
@@ -122,7 +149,7 @@ def test_limits_are_those_of_routes_along_a_lane():
 
 def test_a_control_rate_without_tenths_of_seconds_is_refused():
     with pytest.raises(ConfigError, match=r"timing\.control_hz: expected a multiple of 10 for scores, got 24"):
-        scoring.make_scorer(ScoreSettings(past_rows=0, ends_at_failure=False), control_dt=1 / 24)
+        scoring.make_scorer(settings(), load_config("task", "timing.control_hz=24"), recorded_worlds=0)
 
 
 OFFICIAL = {  # names of V-Max's values of an episode

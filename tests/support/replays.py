@@ -17,6 +17,14 @@ from support.hand_scenes import scene_of
 
 STEPS, HZ = 90, 30
 NAMES = ("first </script> world", "second")
+METRICS = {"off_road": "off the road", "comfort": "discomfort", "overlap": "contact", "red_light_run": "red light run"}
+FAILURES = (  # of the first world: cars 0 and 1; those of car 2 are not scored
+    {
+        0: {"off_road": [], "comfort": [], "overlap": [], "red_light_run": None, "counted": [[0, 89]]},
+        1: {"off_road": [[30, 41]], "comfort": [[12, 14], [24, 24]], "overlap": [], "red_light_run": None, "counted": [[0, 44]]},
+    },
+    {},
+)
 POSTS = (RoadPosts((Light((10.0, 0.0), 0.0, [(0.0, "stop"), (1.0, "go")]),), ((12.0, 5.0),)), RoadPosts())
 
 

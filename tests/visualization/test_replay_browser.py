@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from support.replays import NAMES, POSTS, STEPS, made
+from support.replays import FAILURES, METRICS, NAMES, POSTS, STEPS, made
 
 from scenefactory_jax.visualization.web import replay_page
 from scenefactory_jax.visualization.web.replay_data import RESOLUTION
@@ -39,7 +39,7 @@ def recording():
 @pytest.fixture(scope="module")
 def file(recording, tmp_path_factory):
     path = tmp_path_factory.mktemp("replay") / "page.html"
-    return replay_page.write(path, recording, names=NAMES, posts=POSTS, title="test", goal_radius_m=3.0)
+    return replay_page.write(path, recording, names=NAMES, posts=POSTS, title="test", goal_radius_m=3.0, failures=FAILURES, metrics=METRICS)
 
 
 @pytest.fixture
@@ -218,6 +218,35 @@ def test_charts_and_events_move_the_time(opened):
     text = row.inner_text()
     row.click()
     assert f"{float(page.text_content('#time').split(' ')[0]):.2f} s" in text and f"car {selected(page)}" in text
+
+
+def test_marks_lead_to_where_a_metric_fails(opened):
+    """Rows in the order of the metrics, a mark for each failure, and notes of what is met and what is absent."""
+    page = opened()
+    assert page.is_visible("#failures") and not page.query_selector_all("#failures button"), "car 0 has no failure"
+    page.keyboard.press("1")
+    rows = [row.inner_text().split("\n") for row in page.query_selector_all(".failure")]
+    assert [(row[0], row[-1]) for row in rows] == [("off the road", "1.03 s"), ("discomfort", "0.43 s")]
+    marks = page.query_selector_all("#failures button")
+    assert [mark.get_attribute("title") for mark in marks] == [
+        "off the road, 1.03 to 1.40 s", "discomfort, 0.43 to 0.50 s", "discomfort, 0.83 s"
+    ]  # fmt: skip
+    track = page.query_selector(".failure .track").bounding_box()
+    begin, width = marks[0].bounding_box()["x"] - track["x"], marks[0].bounding_box()["width"]
+    assert abs(begin / track["width"] - 30 / (STEPS - 1)) < 0.03 and abs(width / track["width"] - 11 / (STEPS - 1)) < 0.03
+    for mark, step in zip(marks, (30, 12, 24), strict=True):
+        mark.click()
+        assert step_of(page) == step and "now" in mark.get_attribute("class")
+    notes = page.eval_on_selector_all("#failures p", "all => all.map((one) => one.textContent)")
+    assert notes == ["No failure: contact.", "Absent: red light run."]
+    assert page.text_content("#failures b small") == "scores count up to 1.50 s"
+    page.keyboard.press("m")
+    assert step_of(page) == 30
+    page.keyboard.press("Shift+M")
+    page.keyboard.press("Shift+M")
+    assert step_of(page) == 12
+    page.keyboard.press("2")
+    assert page.is_hidden("#failures"), "not scored"
 
 
 def test_the_address_keeps_time_car_and_world(opened):

@@ -11,13 +11,14 @@ from dataclasses import replace
 import jax
 import numpy as np
 import pytest
-from support.replays import HZ, NAMES, POSTS, STEPS, changed, made
+from support.replays import FAILURES, HZ, METRICS, NAMES, POSTS, STEPS, changed, made
 from support.running import ROOT
 from support.scene_documents import document as scene_document
 from support.scene_documents import written
 
 from scenefactory_jax.cli import hydra_config
 from scenefactory_jax.cli.view import replay
+from scenefactory_jax.core.pytree import unchecked
 from scenefactory_jax.core.raw_scene import LIGHT_STATES, Light, LightPlan, Polyline, RawScene
 from scenefactory_jax.core.types import SURFACES, Events
 from scenefactory_jax.visualization.web import replay_data, replay_page
@@ -34,7 +35,8 @@ def recording():
 
 @pytest.fixture(scope="module")
 def page(recording):
-    return replay_page.document(recording, names=NAMES, posts=POSTS, title="a <title>", goal_radius_m=3.0)
+    shown = {"names": NAMES, "posts": POSTS, "failures": FAILURES, "metrics": METRICS}
+    return replay_page.document(recording, title="a <title>", goal_radius_m=3.0, **shown)
 
 
 def unpacked(page: str) -> list[dict]:
@@ -121,6 +123,24 @@ def test_cars_events_and_traffic(page, recording):
     users = [(user["spans"], user["parked"]) for user in first["traffic"]]
     assert users == [([[STEPS // 2, STEPS - 1]], False), ([[0, STEPS - 1]], True)]
     assert first["lights"][0]["shown"] == [[0.0, "stop"], [1.0, "go"]] and first["signs"] == [[12.0, 5.0]] and not second["lights"]
+
+
+def test_failures_of_metrics_are_told_by_car(page, recording):
+    head = json.loads(re.search(r'id="head">(.*?)</script>', page, re.DOTALL).group(1))
+    assert list(head["metrics"].items()) == list(METRICS.items())
+    assert [{int(car): metrics for car, metrics in world["metrics"].items()} for world in head["worlds"]] == list(FAILURES)
+    assert all(not world["metrics"] for world in unpacked(replay_page.document(recording, goal_radius_m=3.0)))
+    with pytest.raises(ReplayError, match="failures: expected 2, one per world, or none, got 1"):
+        replay_page.document(recording, goal_radius_m=3.0, failures=FAILURES[:1])
+
+
+def test_what_is_not_recorded_is_left_out(recording):
+    """As of an evaluation, which records no actions, rewards and wheels."""
+    missing = dict.fromkeys(("steer", "action", "ttc", "edge_ttc", "grip", "slip", "contact_force", "wheels", "joints"))
+    plain = unchecked(type(recording.shots), **vars(recording.shots) | missing | {"terms": {}})
+    first = unpacked(replay_page.document(unchecked(type(recording), scene=recording.scene, shots=plain), goal_radius_m=3.0))[0]
+    kept = {"x", "y", "yaw", "speed", "goal_distance", "friction_utilization"}
+    assert {name for name in first["arrays"] if ":" not in name} == kept | {"film", "road"} and not first["terms"] and not first["wheels"]
 
 
 def test_every_reward_term_has_a_look_of_its_own(page, recording):

@@ -247,7 +247,7 @@ def test_breakdown_partitions_the_records():
 
 def test_records_round_trip_through_csv(tmp_path):
     records = {**make_records(), "kind": np.repeat(["junction", "straight"], 36), "lap": np.arange(72), "note": np.tile([0.1, np.inf], 36)}
-    write_records(tmp_path / "records.csv", records)
+    write_records(tmp_path / "records.csv", records, metadata={})
     back = read_records(tmp_path / "records.csv")
     assert list(back) == list(records)
     for name, column in records.items():
@@ -267,7 +267,7 @@ def test_bad_records_are_refused_by_name(tmp_path):
         statistics.summarise({**records, "max_drac": np.where(np.arange(72) == 3, np.nan, 1.0)}, **BOOTSTRAP)
     with pytest.raises(RecordsError, match=r"none\.csv: file not found"):
         read_records(tmp_path / "none.csv")
-    write_records(tmp_path / "records.csv", records)
+    write_records(tmp_path / "records.csv", records, metadata={})
     (tmp_path / "records.csv").write_text((tmp_path / "records.csv").read_text().replace("True", "perhaps", 1))
     with pytest.raises(RecordsError, match="expected cells of type bool"):
         read_records(tmp_path / "records.csv")

@@ -1,12 +1,12 @@
 """Lists the agents of packed scenes with their routes, for the record of a suite: names and numbers, no geometry."""
 
-import csv
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from scenefactory_jax.core import column_table
 from scenefactory_jax.core.types import ROUTE_SPACING_M, Scene
 from scenefactory_jax.roadgraph import route_sets
 
@@ -14,11 +14,11 @@ COLUMNS: tuple[str, ...] = ("scene", "agent", "speed_mps", "route_m", "chord_m",
 
 
 def list_agents(name: str, scene: Scene) -> list[dict[str, Any]]:
-    """Returns a row for every agent of a scene; `along_lanes` and what depends on it are empty for an agent without a route."""
+    """Returns a row for every agent of a scene; `along_lanes` and what depends on it are None for an agent without a route."""
     agents, rows = scene.agents, []
     for agent in np.flatnonzero(agents.present).tolist():
         start, end = float(agents.route_start[agent]), float(agents.route_end[agent])
-        row: dict[str, Any] = {name: "" for name in COLUMNS} | {"scene": name, "agent": agent}
+        row: dict[str, Any] = dict.fromkeys(COLUMNS) | {"scene": name, "agent": agent}
         row |= {"speed_mps": round(float(agents.speed[agent]), 2), "route_m": round(float(agents.route_length[agent]), 1)}
         row["chord_m"] = round(float(np.hypot(*(agents.goal[agent] - agents.position[agent]))), 1)
         if end > start and scene.routes.length.shape[0]:
@@ -42,10 +42,8 @@ def _describe_route(scene: Scene, route: int, start: float, end: float) -> dict[
     }
 
 
-def write(path: Path, rows: Iterable[Mapping[str, Any]]) -> None:
-    """Writes rows of `list_agents` as CSV, with the columns that a suite adds to the first."""
+def write(path: Path, rows: Iterable[Mapping[str, Any]], *, metadata: Mapping[str, Any]) -> None:
+    """Writes rows of `list_agents` as `column_table.write` does, with the columns that a suite adds to the first."""
     rows = list(rows)
-    with path.open("w", newline="", encoding="utf-8") as file:
-        writer = csv.DictWriter(file, [*COLUMNS, *(name for name in (rows[0] if rows else {}) if name not in COLUMNS)])
-        writer.writeheader()
-        writer.writerows(rows)
+    names = [*COLUMNS, *(name for name in (rows[0] if rows else {}) if name not in COLUMNS)]
+    column_table.write(path, {name: [row.get(name) for row in rows] for name in names}, metadata=metadata)

@@ -13,6 +13,7 @@ from jaxtyping import Array, Bool, Float
 from scenefactory_jax.core.geometry import safe_norm
 from scenefactory_jax.core.types import RED_STATES
 from scenefactory_jax.env import planning_metrics
+from scenefactory_jax.env.step_metrics import StepMetricsConfig
 from scenefactory_jax.evaluation.metrics import nuplan_steps, scenarionet_steps, vmax_steps, waymax_steps
 from scenefactory_jax.evaluation.metrics.episode_record import CYCLIST, OBJECT, PEDESTRIAN, VEHICLE, EpisodeRecord, find_inside, find_span
 from scenefactory_jax.evaluation.metrics.episode_safety import compute_impact
@@ -31,6 +32,7 @@ def compute_episode_metrics(
     *,
     dt: float = 0.1,
     max_lateral_m: float = scenarionet_steps.MAX_LATERAL_M,
+    surrogates: StepMetricsConfig | None = None,
     as_published: bool | Bool[Array, ""] = False,
 ) -> dict[str, Value]:
     """Computes the metrics of an episode. No metric is valid of an episode without counted states.
@@ -38,9 +40,10 @@ def compute_episode_metrics(
     Args:
         dt: between states, s; V-Max's comfort and bounds of time are meant for 0.1.
         max_lateral_m: distance from the recorded track at which MetaDrive's car is out of road.
+        surrogates: see `measure_steps`.
         as_published: V-Max's at-fault collisions and times on several lanes with the errors of its code.
     """
-    steps = measure_steps(record, dt=dt, as_published=as_published)
+    steps = measure_steps(record, dt=dt, surrogates=surrogates, as_published=as_published)
     return collect_metrics(record, steps, dt=dt, max_lateral_m=max_lateral_m, as_published=as_published)
 
 
@@ -120,8 +123,8 @@ def _collect_routes(record: EpisodeRecord, steps: StepMetrics) -> Pairs:
     }
 
 
-def _collect_comfort(record: EpisodeRecord, *, dt: float) -> Pairs:
-    """V-Max's comfort: of every window of a second that ends in a counted state, whose states are all valid."""
+def find_uncomfortable(record: EpisodeRecord, *, dt: float) -> tuple[Bool[Array, " T"], Bool[Array, " T"]]:
+    """Finds the counted states at which a second ends that is beyond V-Max's bounds of comfort, and those whose second is all valid."""
     rows = planning_metrics.COMFORT_ROWS
     end = jnp.arange(rows - 1, len(record.counted)) if len(record.counted) >= rows else jnp.zeros(0, jnp.int32)
     window = end[:, None] + jnp.arange(-rows + 1, 1)
@@ -129,7 +132,20 @@ def _collect_comfort(record: EpisodeRecord, *, dt: float) -> Pairs:
         planning_metrics.compute_comfort_parts(record.ego.velocity[window], record.ego.yaw[window], dt=dt)
     )
     used = record.counted[end] & jnp.all(record.ego.valid[window], axis=1)
-    return {"comfort": (jnp.all(comfortable | ~used), jnp.any(used))}
+    spread = lambda mask: jnp.zeros_like(record.counted).at[end].set(mask)  # noqa: E731
+    return spread(~comfortable & used), spread(used)
+
+
+def _collect_comfort(record: EpisodeRecord, *, dt: float) -> Pairs:
+    beyond, used = find_uncomfortable(record, dt=dt)
+    return {"comfort": (~jnp.any(beyond), jnp.any(used))}
+
+
+def compute_overspeed(record: EpisodeRecord, steps: StepMetrics) -> Float[Array, " T"]:
+    """Computes the excess over the speed limits that V-Max estimates, m/s."""
+    top = jnp.max(jnp.where(record.log.valid, safe_norm(record.log.velocity), 0.0))
+    limit = vmax_steps.estimate_speed_limit(record.lanes.kind[steps.lane_row], top)
+    return jnp.maximum(safe_norm(record.ego.velocity) - limit, 0.0)
 
 
 def _collect_lanes(record: EpisodeRecord, steps: StepMetrics, *, dt: float, as_published: bool | Bool[Array, ""]) -> Pairs:
@@ -137,9 +153,7 @@ def _collect_lanes(record: EpisodeRecord, steps: StepMetrics, *, dt: float, as_p
     counted, lanes = record.counted, record.lanes
     has_lanes = jnp.any(lanes.valid)
     speed = safe_norm(record.ego.velocity)
-    top = jnp.max(jnp.where(record.log.valid, safe_norm(record.log.velocity), 0.0))
-    over = jnp.maximum(speed - vmax_steps.estimate_speed_limit(lanes.kind[steps.lane_row], top), 0.0)
-    metres = speed * dt
+    over, metres = compute_overspeed(record, steps), speed * dt
     total = lambda values, used: jnp.sum(jnp.where(counted & used, values, 0.0))  # noqa: E731
     seconds = dt * total(jnp.ones_like(speed), steps.several_lanes & (speed > 0))
     oncoming = total(metres, steps.oncoming)
@@ -155,22 +169,34 @@ def _collect_lanes(record: EpisodeRecord, steps: StepMetrics, *, dt: float, as_p
     }
 
 
+def compute_limit_excess(record: EpisodeRecord, steps: StepMetrics) -> tuple[Float[Array, " T"], Bool[Array, " T"]]:
+    """Computes the excess over the lanes' speed limits, m/s, and the counted states on lanes with a known one."""
+    lanes, row = record.lanes, steps.lane_row
+    limited = record.counted & lanes.has_limit[row] & lanes.valid[row]
+    return jnp.where(limited, jnp.maximum(safe_norm(record.ego.velocity) - lanes.speed_limit[row], 0.0), 0.0), limited
+
+
+def find_nuplan_discomfort(record: EpisodeRecord, *, dt: float) -> Bool[Array, " T"]:
+    """Finds the states of the episode, its start included, that are beyond nuPlan's bounds of comfort."""
+    first, last = find_span(record)
+    comfort = nuplan_steps.compute_comfort(record.ego.velocity, record.ego.yaw, first, last, dt=dt)
+    return find_inside(first, last, len(record.counted)) & ~nuplan_steps.is_comfortable(comfort)
+
+
 def _collect_nuplan(record: EpisodeRecord, steps: StepMetrics, *, dt: float) -> Pairs:
     """nuPlan's own metrics; the names of those that V-Max has, too, begin with `nuplan_`."""
-    counted, lanes = record.counted, record.lanes
+    counted, has_lanes = record.counted, jnp.any(record.lanes.valid)
     first, last = find_span(record)
     faults = jnp.any(steps.nuplan_at_fault & counted[:, None], axis=0)
-    touched, has_lanes = jnp.any(steps.touching & counted[:, None]), jnp.any(lanes.valid)
-    wrong = nuplan_steps.measure_wrong_direction(record.ego.position[:, :2], steps.lane_direction, counted, dt=dt)
+    touched = jnp.any(steps.touching & counted[:, None])
+    wrong = jnp.max(nuplan_steps.measure_wrong_direction(record.ego.position[:, :2], steps.lane_direction, counted, dt=dt))
     logged = record.log.valid & (jnp.arange(len(counted)) >= first)
     expert = [record.log.position[row, :2] for row in (jnp.argmax(logged), len(counted) - 1 - jnp.argmax(logged[::-1]))]
     start, end = (nuplan_steps.compute_route_arc(place, record.paths) for place in expert)
     progress = nuplan_steps.score_progress(steps.route_arc[last] - steps.route_arc[first], end - start)
     has_route = jnp.any(record.paths.valid & record.paths.on_route[:, None]) & jnp.any(logged)
     ttc = jnp.min(jnp.where(counted, steps.nuplan_ttc_s, jnp.inf))
-    limited = counted & lanes.has_limit[steps.lane_row] & lanes.valid[steps.lane_row]
-    over = jnp.where(limited, jnp.maximum(safe_norm(record.ego.velocity) - lanes.speed_limit[steps.lane_row], 0.0), 0.0)
-    comfort = nuplan_steps.compute_comfort(record.ego.velocity, record.ego.yaw, first, last, dt=dt)
+    over, limited = compute_limit_excess(record, steps)
     judged = has_lanes | ~touched  # contacts at the sides are judged by lanes
     return {
         "nuplan_no_at_fault_collision": (nuplan_steps.score_collisions(faults, record.others.kind), judged),
@@ -182,7 +208,7 @@ def _collect_nuplan(record: EpisodeRecord, steps: StepMetrics, *, dt: float) -> 
         "nuplan_min_ttc_s": (ttc, True),
         "nuplan_ttc_within_bound": (ttc > nuplan_steps.TTC_BOUND_S, True),
         "nuplan_speed_compliance": (vmax_steps.score_speed(over, counted, steps=last - first), jnp.any(limited)),
-        "nuplan_comfort": (nuplan_steps.is_comfortable(comfort), last - first + 1 >= nuplan_steps.JERK_WIDTH),
+        "nuplan_comfort": (~jnp.any(find_nuplan_discomfort(record, dt=dt)), last - first + 1 >= nuplan_steps.JERK_WIDTH),
     }
 
 
@@ -197,7 +223,7 @@ def _collect_safety(record: EpisodeRecord, steps: StepMetrics) -> Pairs:
     given = record.friction_utilization is not None
     return {
         "min_circles_ttc_s": (ttc, jnp.isfinite(ttc)),
-        "max_drac": (jnp.max(jnp.where(counted, steps.drac, 0.0)), True),
+        "max_drac": (jnp.max(jnp.where(counted, steps.drac, 0.0)), ~jnp.any(jnp.isnan(steps.drac))),
         "encroachment_s": (encroachment, jnp.isfinite(encroachment)),
         "crossing_encroachment_s": (crossing, jnp.isfinite(crossing)),
         "impact_mps": (impact.speed, hit),

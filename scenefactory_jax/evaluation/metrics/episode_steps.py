@@ -12,14 +12,13 @@ from jaxtyping import Array, Bool, Float, Int
 from scenefactory_jax.core.boxes import find_overlaps
 from scenefactory_jax.core.geometry import cover_with_circles, safe_norm
 from scenefactory_jax.env.planning_metrics import compute_time_to_overlap
+from scenefactory_jax.env.step_metrics import StepMetricsConfig
 from scenefactory_jax.env.surrogate_safety import compare_pairs, minimum_over_pairs
 from scenefactory_jax.evaluation.metrics import nuplan_steps, scenarionet_steps, vmax_steps, waymax_steps
 from scenefactory_jax.evaluation.metrics.episode_record import EpisodeRecord, find_inside, find_span
 from scenefactory_jax.evaluation.metrics.episode_safety import compute_encroachment
 
 TTC_HORIZON_S = 5.0
-CIRCLES = {"radius_fraction": 0.55, "radius_floor_m": 0.45, "spacing_limit_m": 1.3}  # as conf/step_metrics
-DRAC_GAP_FLOOR_M = 1.0
 
 
 class StepMetrics(NamedTuple):
@@ -43,15 +42,21 @@ class StepMetrics(NamedTuple):
     lane_direction: Float[Array, "T 2"]
     route_arc: Float[Array, " T"]
     circles_ttc_s: Float[Array, " T"]  # inf without an approach
-    drac: Float[Array, " T"]
+    drac: Float[Array, " T"]  # NaN without circles
     encroachment_s: Float[Array, " T"]
     crossing_s: Float[Array, " T"]
     track_arc: Float[Array, " T"]
     track_distance: Float[Array, " T"]
 
 
-def measure_steps(record: EpisodeRecord, *, dt: float, as_published: bool | Bool[Array, ""] = False) -> StepMetrics:
-    """Computes the metrics of all states; those of states that are not valid have no meaning."""
+def measure_steps(
+    record: EpisodeRecord, *, dt: float, surrogates: StepMetricsConfig | None = None, as_published: bool | Bool[Array, ""] = False
+) -> StepMetrics:
+    """Computes the metrics of all states; those of states that are not valid have no meaning.
+
+    Args:
+        surrogates: the circles that stand for road users, and the gap of DRAC; None: no measures between circles.
+    """
     ego, others = record.ego, record.others
     touching = find_overlaps(ego.position[:, None, :2], ego.yaw[:, None], record.size, *_at_all_steps(record), others.size)
     first, last = find_span(record)
@@ -62,7 +67,7 @@ def measure_steps(record: EpisodeRecord, *, dt: float, as_published: bool | Bool
 
     def at_step(step: Int[Array, ""]) -> dict[str, Array]:
         contacts = find_contacts(record, step, as_published=as_published)
-        found = _measure_road(record, step) | _measure_safety(record, step)
+        found = _measure_road(record, step) | _measure_safety(record, step, surrogates)
         encroachment, crossing = compute_encroachment(record, step, counted, dt=dt)
         found |= {"encroachment_s": encroachment, "crossing_s": crossing}
         return found | _judge_contacts(record, step, contacts, found, collided[step], fresh[step])
@@ -108,21 +113,21 @@ def _measure_road(record: EpisodeRecord, step: Int[Array, ""]) -> dict[str, Arra
     }
 
 
-def _measure_safety(record: EpisodeRecord, step: Int[Array, ""]) -> dict[str, Array]:
+def _measure_safety(record: EpisodeRecord, step: Int[Array, ""], surrogates: StepMetricsConfig | None) -> dict[str, Array]:
     """Times to collision of V-Max and between circles, and DRAC."""
     ego, others = record.ego, record.others
     valid = others.valid[:, step]
     car = (ego.position[step, :2][None], ego.yaw[step][None], ego.velocity[step][None], record.size[None])
     users = (others.position[:, step], others.yaw[:, step], others.velocity[:, step], others.size)
+    ttc = compute_time_to_overlap(*car, *users, valid[None], horizon_s=TTC_HORIZON_S)[0]
+    if surrogates is None:
+        return {"ttc_s": ttc, "circles_ttc_s": jnp.full((), jnp.inf), "drac": jnp.full((), jnp.nan)}
     position, yaw, velocity, size = (jnp.concatenate(pair) for pair in zip(car, users, strict=True))
-    centres, radius = cover_with_circles(position, yaw, size, **CIRCLES)
-    pairs = compare_pairs(centres, radius, velocity, yaw[:1], drac_gap_floor_m=DRAC_GAP_FLOOR_M)
+    centres, radius = cover_with_circles(position, yaw, size, **vars(surrogates.circles))
+    pairs = compare_pairs(centres, radius, velocity, yaw[:1], drac_gap_floor_m=surrogates.drac_gap_floor_m)
     present = jnp.concatenate([jnp.ones(1, bool), valid])
-    return {
-        "ttc_s": compute_time_to_overlap(*car, *users, valid[None], horizon_s=TTC_HORIZON_S)[0],
-        "circles_ttc_s": minimum_over_pairs(pairs.ttc, present)[0],
-        "drac": jnp.max(jnp.where(present, pairs.drac[0], 0.0)),
-    }
+    drac = jnp.max(jnp.where(present, pairs.drac[0], 0.0))
+    return {"ttc_s": ttc, "circles_ttc_s": minimum_over_pairs(pairs.ttc, present)[0], "drac": drac}
 
 
 def _judge_contacts(

@@ -13,14 +13,13 @@ from scenefactory_jax.core.geometry import dot, heading_vector, safe_norm, to_fr
 from scenefactory_jax.core.savitzky_golay import filter_range
 from scenefactory_jax.env.planning_metrics import compute_time_to_overlap, find_ahead, find_behind
 from scenefactory_jax.evaluation.metrics import waymax_steps
-from scenefactory_jax.evaluation.metrics.episode_record import CYCLIST, OBJECT, PEDESTRIAN, VEHICLE, Lanes, find_inside
+from scenefactory_jax.evaluation.metrics.episode_record import CYCLIST, OBJECT, PEDESTRIAN, VEHICLE, Lanes
 from scenefactory_jax.evaluation.metrics.vmax_steps import STANDING_MPS, Contacts, measure_lane_distances
 from scenefactory_jax.roadgraph.signed_edge_distance import EdgePoints, compute_line_distance
 
 CLASSES = ((PEDESTRIAN, CYCLIST), (VEHICLE,), (OBJECT,))
 ALLOWED = (0, 0, 1)  # collisions of each class
 OUTSIDE_M = 0.3  # of a corner
-HALF_LANE_M = 3.7 / 2
 DIRECTION_WINDOW_S = 1.0
 PROGRESS_M = 2.0  # smaller progress, of car or expert, counts as this
 TTC_HORIZON_S, TTC_BOUND_S, TTC_STANDING_MPS = 3.0, 0.95, 0.005
@@ -59,7 +58,7 @@ def find_lane_direction(position: Float[Array, "d"], yaw: Float[Array, ""], lane
     squared = measure_lane_distances(position, lanes)
     own = jnp.argmin(jnp.where(dot(lanes.direction, heading_vector(yaw)) >= 0, squared, jnp.inf))
     nearest = jnp.argmin(squared)
-    is_on = lambda row: lanes.valid[row] & (safe_norm(position[:2] - lanes.position[row, :2]) <= HALF_LANE_M)  # noqa: E731
+    is_on = lambda row: lanes.valid[row] & (safe_norm(position[:2] - lanes.position[row, :2]) <= waymax_steps.HALF_LANE_M)  # noqa: E731
     follows = is_on(own) & (dot(lanes.direction[own], heading_vector(yaw)) >= 0)
     row = jnp.where(follows, own, nearest)
     return jnp.where(is_on(row), lanes.direction[row], 0.0)
@@ -67,14 +66,14 @@ def find_lane_direction(position: Float[Array, "d"], yaw: Float[Array, ""], lane
 
 def measure_wrong_direction(
     position: Float[Array, "T 2"], lane_direction: Float[Array, "T 2"], counted: Bool[Array, " T"], *, dt: float
-) -> Float[Array, ""]:
-    """Computes the most metres that a car drove against its lanes within a second; 0 if it never did."""
+) -> Float[Array, " T"]:
+    """Computes the metres that a car drove against its lanes within the second before each counted state; 0 elsewhere."""
     step = jnp.diff(position, axis=0, prepend=position[:1])
     along = jnp.where(counted, dot(step, lane_direction), 0.0)
     width = round(DIRECTION_WINDOW_S / dt)
     window = jnp.arange(-width + 1, 1) + jnp.arange(len(along))[:, None]
     sums = jnp.sum(jnp.where(window >= 0, along[jnp.maximum(window, 0)], 0.0), axis=1)
-    return jnp.maximum(0.0, -jnp.min(jnp.where(counted, sums, 0.0)))
+    return jnp.maximum(0.0, jnp.where(counted, -sums, 0.0))
 
 
 def compute_route_arc(position: Float[Array, "2"], paths: waymax_steps.Paths) -> Float[Array, ""]:
@@ -124,27 +123,26 @@ def compute_time_to_collision(
 
 
 class Comfort(NamedTuple):
-    """Extremes over an episode, in the units of the bounds."""
+    """Extremes over an episode, or the values of each state, in the units of the bounds."""
 
-    lowest: Float[Array, ""]  # longitudinal acceleration
-    highest: Float[Array, ""]
-    lateral: Float[Array, ""]  # this and the following: of the size
-    yaw_rate: Float[Array, ""]
-    yaw_acceleration: Float[Array, ""]
-    longitudinal_jerk: Float[Array, ""]
-    jerk: Float[Array, ""]  # of the change of the acceleration's size
+    lowest: Float[Array, "*t"]  # longitudinal acceleration
+    highest: Float[Array, "*t"]
+    lateral: Float[Array, "*t"]  # this and the following: of the size
+    yaw_rate: Float[Array, "*t"]
+    yaw_acceleration: Float[Array, "*t"]
+    longitudinal_jerk: Float[Array, "*t"]
+    jerk: Float[Array, "*t"]  # of the change of the acceleration's size
 
 
 def compute_comfort(
     velocity: Float[Array, "T 2"], yaw: Float[Array, " T"], first: Int[Array, ""], last: Int[Array, ""], *, dt: float
 ) -> Comfort:
-    """Computes the extremes over the states from `first` to `last`, of which there must be JERK_WIDTH.
+    """Computes the values of the states from `first` to `last`, of which there must be JERK_WIDTH; those of others have no meaning.
 
     nuPlan's car states its acceleration; here it is the central difference of the velocity. Accelerations are smoothed, and jerks are
     derivatives of what is smoothed.
     """
     row = jnp.arange(len(yaw))
-    inside = find_inside(first, last, len(yaw))
     before, after = jnp.clip(row - 1, first, last), jnp.clip(row + 1, first, last)
     acceleration = (velocity[after] - velocity[before]) / (jnp.maximum(after - before, 1) * dt)[:, None]
     local = to_frame(acceleration, yaw)
@@ -153,20 +151,19 @@ def compute_comfort(
     )
     along, across, total = (smooth(values, ACCELERATION_WIDTH, 2, 0) for values in (local[:, 0], local[:, 1], safe_norm(acceleration)))
     unwrapped = jnp.concatenate([jnp.zeros(1), jnp.cumsum(wrap_angle(jnp.diff(yaw)))])
-    largest = lambda values: jnp.max(jnp.where(inside, jnp.abs(values), 0.0))  # noqa: E731
     return Comfort(
-        lowest=jnp.min(jnp.where(inside, along, jnp.inf)),
-        highest=jnp.max(jnp.where(inside, along, -jnp.inf)),
-        lateral=largest(across),
-        yaw_rate=largest(smooth(unwrapped, YAW_WIDTH, 2, 1)),
-        yaw_acceleration=largest(smooth(unwrapped, YAW_WIDTH, 3, 2)),
-        longitudinal_jerk=largest(smooth(along, JERK_WIDTH, 2, 1)),
-        jerk=largest(smooth(total, JERK_WIDTH, 2, 1)),
+        lowest=along,
+        highest=along,
+        lateral=jnp.abs(across),
+        yaw_rate=jnp.abs(smooth(unwrapped, YAW_WIDTH, 2, 1)),
+        yaw_acceleration=jnp.abs(smooth(unwrapped, YAW_WIDTH, 3, 2)),
+        longitudinal_jerk=jnp.abs(smooth(along, JERK_WIDTH, 2, 1)),
+        jerk=jnp.abs(smooth(total, JERK_WIDTH, 2, 1)),
     )
 
 
-def is_comfortable(comfort: Comfort) -> Bool[Array, ""]:
-    """Whether all extremes are within nuPlan's bounds."""
+def is_comfortable(comfort: Comfort) -> Bool[Array, "*t"]:
+    """Whether all values are within nuPlan's bounds."""
     low, high = LONGITUDINAL
     within = (comfort.lowest >= low) & (comfort.highest <= high) & (comfort.lateral <= LATERAL) & (comfort.yaw_rate <= YAW_RATE)
     within &= (comfort.yaw_acceleration <= YAW_ACCELERATION) & (comfort.longitudinal_jerk <= LONGITUDINAL_JERK)

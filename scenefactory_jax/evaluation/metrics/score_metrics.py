@@ -39,7 +39,7 @@ SCORES = {  # in the order of reports: label, unit, definition
     "nuplan_comfort": ("nuPlan: comfort", RATE, "Episodes within nuPlan's bounds of comfort."),
     "log_divergence_m": ("Log divergence", "m", "Mean distance from the recorded position (Waymax)."),
     "encroachment_s": ("Post-encroachment time", "s", "Smallest time between two road users on the same place."),
-    "delta_v_equal_masses_mps": ("Delta-v", "m/s", "Change of the car's speed in its first impact, between equal masses."),
+    "delta_v_mps": ("Delta-v", "m/s", "Change of the car's speed in the worst of its first impacts, by the masses of both."),
     "cost": ("Cost", "states", "States beside the recorded way or in contact, each kind for itself (MetaDrive, ScenarioNet)."),
 }  # fmt: skip
 

@@ -13,11 +13,10 @@ from scenefactory_jax.core.geometry import cross, dot, heading_vector, safe_norm
 from scenefactory_jax.core.types import LANE_FREEWAY
 from scenefactory_jax.env.planning_metrics import find_behind
 from scenefactory_jax.evaluation.metrics.episode_record import CYCLIST, PEDESTRIAN, Lanes
-from scenefactory_jax.evaluation.metrics.waymax_steps import HEIGHT_SCALE, place_corners
+from scenefactory_jax.evaluation.metrics.waymax_steps import HEIGHT_SCALE, OFF_LANE_M, place_corners
 
 STANDING_MPS = 0.05
 FRONT_EDGE_M = 0.01  # length of the box that stands for the car's front edge; published: 0, whose contacts depend on rounding
-HALF_LANE_M = 3.7 / 2 + 0.2
 MPH = 1 / 2.237  # m/s, as V-Max rounds it
 LIMITS_MPH = (25.0, 35.0, 45.0, 70.0)  # to which a log's top speed is rounded up
 FREEWAY_MPH, STREET_MPH = 70.0, 45.0
@@ -91,8 +90,8 @@ def locate_on_lanes(position: Float[Array, "d"], yaw: Float[Array, ""], size: Fl
         distance = across(jnp.argmin(jnp.where(chosen, squared, jnp.inf), axis=1))
         return jnp.where(jnp.any(chosen & lanes.valid), distance, jnp.inf)
 
-    oncoming = jnp.any(measure_nearest(aligned) > HALF_LANE_M) & jnp.all(measure_nearest(~aligned) < HALF_LANE_M)
-    return LanePlace(nearest, jnp.any(across(nearest) > HALF_LANE_M) & lanes.valid[nearest], oncoming)
+    oncoming = jnp.any(measure_nearest(aligned) > OFF_LANE_M) & jnp.all(measure_nearest(~aligned) < OFF_LANE_M)
+    return LanePlace(nearest, jnp.any(across(nearest) > OFF_LANE_M) & lanes.valid[nearest], oncoming)
 
 
 def measure_lane_distances(point: Float[Array, "*n d"], lanes: Lanes) -> Float[Array, "*n P"]:

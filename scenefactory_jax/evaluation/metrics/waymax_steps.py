@@ -18,7 +18,9 @@ from scenefactory_jax.roadgraph.signed_edge_distance import EdgePoints, compute_
 HEIGHT_SCALE = 2.0  # of the search for the nearest road-edge point
 ACCELERATION_LIMIT, CURVATURE_LIMIT, TOLERANCE = 10.4, 0.3, 0.001  # m/s^2, 1/m: kinematically feasible
 WAYMAX_OFF_ROUTE = (5.0, 2.0)  # m: from the on-route paths; by which other paths are nearer
-VMAX_OFF_ROUTE = (3.7 / 2 + 0.2, (3.7 / 2 + 0.2) / 2 + 0.2)
+HALF_LANE_M = 3.7 / 2  # half the usual width of a lane
+OFF_LANE_M = HALF_LANE_M + 0.2  # from a lane's line a point is off that lane
+VMAX_OFF_ROUTE = (OFF_LANE_M, OFF_LANE_M / 2 + 0.2)
 WRONG_WAY_M = 3.5
 
 

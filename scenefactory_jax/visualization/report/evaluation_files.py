@@ -9,11 +9,12 @@ import numpy as np
 from scenefactory_jax.core.trajectory import Trajectory
 from scenefactory_jax.evaluation import circumstances, episode_records, statistics
 from scenefactory_jax.evaluation.protocols import Evaluated
-from scenefactory_jax.evaluation.records import Records, begin_folder, write_records
+from scenefactory_jax.evaluation.records import Records, begin_folder, name_file, write_records
 from scenefactory_jax.evaluation.statistics import Estimate
 from scenefactory_jax.loggers import metrics_csv
 from scenefactory_jax.visualization.birds_eye import figures, video
-from scenefactory_jax.visualization.report import evaluation_report, failure_pictures, plots
+from scenefactory_jax.visualization.report import evaluation_report, failure_pictures, planner_table, plots
+from scenefactory_jax.visualization.web import episode_page
 
 
 class Result(NamedTuple):
@@ -30,7 +31,7 @@ def write(
     evaluated: Iterable[Evaluated],
     *,
     config: Mapping[str, Any],
-    run: Path,
+    run: Path | None,
     request: Mapping[str, Any],
     settings: Mapping[str, Any],
     versions: Mapping[str, str],
@@ -42,20 +43,23 @@ def write(
 
     Args:
         config: of the evaluated environment.
-        run: folder of the run, for its learning curves.
+        run: folder of the run, for its learning curves; None: planners alone.
         request: run, scenes (None: the run's own held-out ones), overrides, protocol, protocols and trust of the command.
         settings: of the evaluation, with `video`, `failures`, `bootstrap` and `seed`.
         command: repeats the evaluation.
     """
     out.mkdir(parents=True, exist_ok=True)
-    episodes = circumstances.describe(config)
-    records, trajectories, pictures = {}, [], {}
+    episodes = _describe_episodes(config, settings)
+    records, trajectories, pictures, pages = {}, [], {}, {}
     for evaluation in evaluated:
         label, recording = evaluation.label, evaluation.recording
         if not records:
             begin_folder(out, {**request, "episodes": episodes, **{key: settings[key] for key in ("seed", "repeats", "untrained")}})
         records[label] = evaluation.records
-        write_records(out / _agents_file(label), evaluation.records)
+        _write_agents(out, evaluation, protocol=request["protocol"], versions=versions)
+        if recording is not None and recording.failures is not None and (shown := settings["replay_worlds"]):
+            page = out / f"replay-{label.replace(', ', '-')}.html"
+            pages[f"Episodes, {label}"] = episode_page.write(page, recording, evaluation.records, worlds=shown)
         if recording is None or evaluation.policy != "trained":
             continue
         if settings["video"]["enable"] and not trajectories:
@@ -65,10 +69,12 @@ def write(
         if settings["failures"]["pictures"]["enable"]:
             pictures[label] = failure_pictures.draw(out, label, evaluation.records, recording, settings)
     summary = {name: statistics.summarise(rows, bootstrap=settings["bootstrap"], seed=settings["seed"]) for name, rows in records.items()}
-    metrics = metrics_csv.read(run)
-    files = {f"Agents, {name}": out / _agents_file(name) for name in records}
+    metrics = metrics_csv.read(run) if run else []
+    files = {f"Agents, {name}": out / name_file(name) for name in records} | pages
     files["Failures, ranked"] = failure_pictures.write(out, records, pictures)
-    if metrics:
+    if rows := planner_table.select_policies(summary):
+        files["Planners and metrics"] = planner_table.write(out, rows, records)
+    if run and metrics:
         files["Metrics of the training"] = run / metrics_csv.FILE
     report = evaluation_report.write(
         out,
@@ -88,16 +94,24 @@ def write(
     return Result(out, records, summary, report)
 
 
+def _write_agents(out: Path, evaluation: Evaluated, *, protocol: str, versions: Mapping[str, str]) -> None:
+    metadata = {"protocol": protocol, "termination": evaluation.protocol, "policy": evaluation.policy}
+    metadata |= {"config_digest": evaluation.digest, "versions": versions}
+    write_records(out / name_file(evaluation.label), evaluation.records, metadata=metadata)
+
+
+def _describe_episodes(config: Mapping[str, Any], settings: Mapping[str, Any]) -> dict[str, str]:
+    noise = (settings.get("protocol", {}).get("scores") or {}).get("noise")
+    added = {"Second before the start": "one random held action (V-Max's noisy start)"} if noise else {}
+    return circumstances.describe(config) | added
+
+
 def format_title(name: str, request: Mapping[str, Any]) -> str:
     """Formats the heading; only the run's own held-out scenes are called scenes not seen in training."""
     if request["scenes"] is not None:
         return f"{name}: evaluation on {Path(request['scenes']).name}"
     changed = any(override.startswith("scenes") for override in request["overrides"])
     return f"{name}: evaluation on {'other scenes' if changed else 'scenes not seen in training'}"
-
-
-def _agents_file(label: str) -> str:
-    return f"agents-{label.replace(', ', '-')}.csv"
 
 
 def _draw_figures(
@@ -110,9 +124,11 @@ def _draw_figures(
     """Caption -> picture."""
     drawn = {}
     for name in summary:
-        if (baseline := name + evaluation_report.UNTRAINED) in summary:
+        if (baseline := name + planner_table.UNTRAINED) in summary:
             figure = plots.rates_figure({"untrained": summary[baseline], "trained": summary[name]})
             drawn[f"Untrained and trained, {name}"] = figure, f"comparison-{name}"
+    if rows := planner_table.select_policies(summary):
+        drawn["Planners and metrics"] = planner_table.draw_figure(rows), planner_table.FILE
     if metrics:
         drawn["Training"] = plots.learning_figure(metrics), "learning"
     first = next(iter(records))

@@ -9,14 +9,15 @@ import numpy as np
 from scenefactory_jax.core import markdown
 from scenefactory_jax.core.config import flatten
 from scenefactory_jax.evaluation import failures, statistics
+from scenefactory_jax.evaluation.metrics.agent_metrics import METRICS
 from scenefactory_jax.evaluation.records import Records
 from scenefactory_jax.visualization.birds_eye.drawing import MARKS
-from scenefactory_jax.visualization.report import document, policy_comparison, tables
+from scenefactory_jax.visualization.report import document, planner_table, policy_comparison, tables
+from scenefactory_jax.visualization.report.planner_table import UNTRAINED
 from scenefactory_jax.visualization.report.tables import Summary, format_estimate
 
 BREAKDOWNS = ("surface", "film_mm")  # columns of records
 RATES = ("success_rate", "clean_success_rate", "collision_rate", "road_edge_rate", "crash_rate", "mean_time_to_goal_s")  # of breakdowns
-UNTRAINED = ", untrained"  # ending of the name of a baseline's records
 MAX_GROUPS, MAX_FAILURES = 20, 40  # rows of tables; the CSV files have all
 
 
@@ -49,17 +50,18 @@ def write(
         failure_pictures: name of records -> failure type -> picture of the worst; "film" -> their video.
     """
     resampling = {"bootstrap": settings["bootstrap"], "seed": settings["seed"]}
-    others = {name: rows for name, rows in records.items() if ", " in name and not name.endswith(UNTRAINED)}  # planners
+    rows = planner_table.select_policies(records)
     trained = {name: rows for name, rows in records.items() if ", " not in name}
-    first, thresholds = next(iter(trained)), failures.list_thresholds(settings["failures"])
+    first, thresholds = next(iter(trained or records)), failures.list_thresholds(settings["failures"])
     return document.write(
         folder / "report.md",
         f"# {title}",
         _headline(first, summary[first], records[first]),
         document.section("Episodes", markdown.format_table(["", ""], list(episodes.items())) if episodes else ""),
-        document.section("Results", *_results({name: summary[name] for name in trained | others}, trained | others)),
+        document.section("Results", *_results({name: summary[name] for name in trained | rows}, trained | rows)),
         document.section("Comparison", *(_compare(name, summary, records, resampling) for name in trained if name + UNTRAINED in records)),
-        document.section("Against planners", *policy_comparison.compare_policies(records, [*others], resampling)),
+        document.section("Planners and metrics", *_tabulate_planners({name: summary[name] for name in rows}, rows)),
+        document.section("Differences", *policy_comparison.compare_policies(rows, resampling)),
         document.section("Video", *(document.picture(folder, path, caption) for caption, path in videos.items())),
         document.section("By condition", *_break_down(first, records[first], resampling)),
         document.section(
@@ -67,7 +69,7 @@ def write(
             *(_failures(folder, name, rows, failure_pictures.get(name, {}), thresholds) for name, rows in trained.items()),
         ),
         document.section("Figures", *(document.picture(folder, path, caption) for caption, path in figures.items())),
-        document.section("What the numbers mean", *_definitions(summary, trained)),
+        document.section("What the numbers mean", *_definitions(summary)),
         document.section(
             "Set-up",
             markdown.format_table(["Machine and software", ""], list(versions.items())),
@@ -81,9 +83,12 @@ def write(
 def _headline(name: str, summary: Summary, records: Records) -> str:
     reached, agents = int(np.sum(records["goal_reached"])), len(records["scene"])
     scenes, success, clean = len(np.unique(records["scene"])), summary["success_rate"], summary["clean_success_rate"]
+    what = f"{reached} of {agents} cars reached their goal ({format_estimate(success)}), {format_estimate(clean)} without any other event"
+    if "accuracy" in summary:
+        scores = (f"{METRICS[score].label} {format_estimate(summary[score])}" for score in planner_table.SCORED if score in summary)
+        what = f"{agents} cars: {', '.join(scores)}"
     parts = [
-        f"**{reached} of {agents} cars reached their goal ({format_estimate(success)}), {format_estimate(clean)} without any other event** "
-        f"(protocol: {name}).",
+        f"**{what}** (protocol: {name}).",
         f"{document.count(scenes, 'scene')}, {document.count(_count_episodes(records), 'episode')}; deterministic policy; "
         f"seeds {_list_seeds(records)}.",
         "Numbers in brackets are 95 % intervals: were the evaluation repeated on other scenes of this kind, the true rate would lie "
@@ -94,6 +99,12 @@ def _headline(name: str, summary: Summary, records: Records) -> str:
     if faults := int(np.sum(records["numerical_error"])):
         parts.append(f"**{document.count(faults, 'agent')} ended by a fault of the simulation**, a bug to look into, not a driving error.")
     return " ".join(parts)
+
+
+def _tabulate_planners(summary: Mapping[str, Summary], records: Mapping[str, Records]) -> list[str]:
+    if not records:
+        return []
+    return [planner_table.format_table(summary, records), planner_table.NOTE, tables.explain_marks(summary.values())]
 
 
 def _results(summary: Mapping[str, Summary], records: Mapping[str, Records]) -> list[str]:
@@ -177,8 +188,8 @@ def _describe_failure(records: Records, row: int) -> str:
     return kind + (f"; also {', '.join(events)}" if events else "")
 
 
-def _definitions(summary: Mapping[str, Summary], trained: Mapping[str, Records]) -> list[str]:
-    protocols = tables.define_protocols(trained)
+def _definitions(summary: Mapping[str, Summary]) -> list[str]:
+    protocols = tables.define_protocols({name.partition(", ")[0] for name in summary})
     note = (
         "DRAC treats cars as circles and the gap as at least 1 m, in every direction, so it is large for any two cars that pass closely; "
         "compare it between policies rather than with road data."

@@ -1,50 +1,67 @@
-"""Paired differences between the trained policy and planners on the same episodes, corrected for the number of comparisons."""
+"""Paired differences on the same episodes, between a policy and the others or between two evaluations, corrected for their number."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
+from typing import NamedTuple
 
 from scenefactory_jax.core import markdown
 from scenefactory_jax.evaluation import statistics
 from scenefactory_jax.evaluation.metrics.agent_metrics import METRICS
 from scenefactory_jax.evaluation.records import Records
+from scenefactory_jax.evaluation.statistics import Estimate
 from scenefactory_jax.visualization.report import tables
+from scenefactory_jax.visualization.report.planner_table import name_policy
 
-COMPARED = (
-    "vmax_score", "nuplan_score", "accuracy", "at_fault_collision", "success_rate", "clean_success_rate", "clean_completion_rate",
-    "collision_rate", "road_edge_rate", "red_light_rate",
-)  # fmt: skip
+SCORED = ("vmax_score", "nuplan_score", "accuracy", "overlap", "at_fault_collision", "off_road", "red_light_run", "progression")
+COUNTED = ("success_rate", "clean_success_rate", "clean_completion_rate", "collision_rate", "road_edge_rate", "red_light_rate")
 LEVEL = 0.05
 
 
-def compare_policies(records: Mapping[str, Records], others: Sequence[str], resampling: Mapping[str, int]) -> list[str]:
-    """Formats a table: a row for each metric of COMPARED, the trained policy less each planner, and what Holm's correction leaves.
+class Pair(NamedTuple):
+    """Records of the same agents; the difference is `after` less `before`."""
+
+    before: Records
+    after: Records
+
+
+def compare_policies(records: Mapping[str, Records], resampling: Mapping[str, int]) -> list[str]:
+    """Formats the first policy of each protocol less each other one.
 
     Args:
         records: "PROTOCOL" -> of the trained policy; "PROTOCOL, PLANNER" -> of a planner.
-        others: names of the planners' records.
         resampling: `bootstrap` and `seed` of the intervals.
     """
-    found = {
-        (name, metric): estimate
-        for name in others
-        for metric, estimate in statistics.difference(records[name], records[name.partition(", ")[0]], **resampling).items()
-        if metric in COMPARED
-    }
-    if not found:
+    first: dict[str, str] = {}
+    for label in records:
+        first.setdefault(label.partition(", ")[0], label)
+    references = {label: first[label.partition(", ")[0]] for label in records}
+    pairs = {label: Pair(records[label], records[first]) for label, first in references.items() if label != first}
+    if not pairs:
         return []
+    name = name_policy(next(iter(first.values())))
+    subject = "The trained policy" if name == "policy" else f"The planner {name}"
+    table = compare_pairs({name_policy(label): pair for label, pair in pairs.items()}, resampling, heading="Difference to")
+    return [f"{subject} less each other policy, on the same episodes.", *table]
+
+
+def compare_pairs(pairs: Mapping[str, Pair], resampling: Mapping[str, int], *, heading: str) -> list[str]:
+    """Formats a table: a row for each metric of SCORED, or of COUNTED where there are no scores, a column a pair, marked by Holm's rule.
+
+    Raises:
+        RecordsError: a pair of different scenes.
+    """
+    differences = {name: statistics.difference(pair.before, pair.after, **resampling) for name, pair in pairs.items()}
+    compared = SCORED if any(SCORED[0] in estimates for estimates in differences.values()) else COUNTED
+    found = {(name, metric): row[metric] for name, row in differences.items() for metric in compared if metric in row}
     adjusted = statistics.adjust_holm({key: estimate.p for key, estimate in found.items() if estimate.p is not None})
-
-    def format_cell(name: str, metric: str) -> str:
-        estimate = found.get((name, metric))
-        if estimate is None:
-            return ""
-        mark = " \\*" if adjusted.get((name, metric), 1.0) < LEVEL else ""
-        return tables.format_estimate(estimate, signed=True) + mark
-
-    metrics = [metric for metric in COMPARED if any((name, metric) in found for name in others)]
-    rows = [[METRICS[metric].label, *(format_cell(name, metric) for name in others)] for metric in metrics]
+    metrics = [metric for metric in compared if any((name, metric) in found for name in pairs)]
+    cells = {key: _format_difference(estimate, adjusted.get(key, 1.0)) for key, estimate in found.items()}
+    rows = [[METRICS[metric].label, *(cells.get((name, metric), "") for name in pairs)] for metric in metrics]
     return [
-        f"The trained policy less each planner, on the same episodes. \\*: below {LEVEL:g} after Holm's correction for all {len(adjusted)} "
-        "comparisons of this table; the others are no findings.",
-        markdown.format_table(["Difference to", *(name.partition(", ")[2] for name in others)], rows),
-        tables.explain_marks([{metric: found[name, metric] for metric in metrics if (name, metric) in found} for name in others]),
+        f"\\*: below {LEVEL:g} after Holm's correction for all {len(adjusted)} comparisons of this table; the others are no findings.",
+        markdown.format_table([heading, *pairs], rows),
+        tables.explain_marks([{metric: found[name, metric] for metric in metrics if (name, metric) in found} for name in pairs]),
     ]
+
+
+def _format_difference(estimate: Estimate, adjusted: float) -> str:
+    return tables.format_estimate(estimate, signed=True) + (" \\*" if adjusted < LEVEL else "")

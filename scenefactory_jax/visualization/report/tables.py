@@ -13,6 +13,8 @@ Summary = Mapping[str, Estimate]  # metric -> estimate
 PROTOCOLS = {
     "strict": "any event (goal, collision, crash, road edge) ends the agent",
     "goal_only": "events are counted but only the goal ends an agent, so an agent may collide and still reach its goal",
+    "rules": "any event of strict, a red light or stop sign that is run, or leaving the route ends the agent",
+    "whole": "nothing but time ends an agent, not even its goal: episodes are scored as a whole",
 }
 MARKS = {WILSON: "†", NEWCOMBE: "†", AGENTS: "‡"}  # of intervals that are no bootstrap over scenes
 _NOTES = {
@@ -39,7 +41,7 @@ def format_estimate(estimate: Estimate, *, signed: bool = False) -> str:
         return f"{value * scale + 0.0:{sign}.{digits}f}"
 
     interval = "" if estimate.low is None or estimate.high is None else f" [{number(estimate.low)}, {number(estimate.high)}]"
-    return f"{number(estimate.value)} {unit}{interval}{MARKS.get(estimate.method, '')}"
+    return f"{f'{number(estimate.value)} {unit}'.strip()}{interval}{MARKS.get(estimate.method, '')}"
 
 
 def format_summaries(summaries: Mapping[str, Summary], *, signed: Sequence[str] = ()) -> str:

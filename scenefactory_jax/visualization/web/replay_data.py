@@ -1,6 +1,7 @@
 """Converts a recording to the data of the web page: for every world a head of plain JSON and packed arrays."""
 
 import itertools
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -25,12 +26,15 @@ TERM_RESOLUTION = 2e-4
 WHEELS = ("FL", "FR", "RL", "RR")  # the order of `dynamics.car.WHEELS`
 
 
-def world(recording: Recording, index: int, *, name: str, posts: RoadPosts) -> tuple[dict[str, Any], str]:
+def world(
+    recording: Recording, index: int, *, name: str, posts: RoadPosts, failures: Mapping[int, Mapping[str, Any]]
+) -> tuple[dict[str, Any], str]:
     """Head and arrays of one world, until one second after its last active step.
 
     Args:
         recording: on the host.
         index: of the world.
+        failures: car -> metric -> [first, last] step of each failure; None: the metric is absent.
     """
     scene, shots, active, hz = cut_world(recording, index)
     packer, shown = Packer(), find_shown_steps(active)
@@ -55,6 +59,7 @@ def world(recording: Recording, index: int, *, name: str, posts: RoadPosts) -> t
         "traffic": traffic,
         "lights": [light._asdict() for light in posts.lights],
         "signs": [_rounded(place) for place in posts.signs],
+        "metrics": {str(car): dict(metrics) for car, metrics in failures.items()},
         "arrays": packer.directory,
     }
     return head, packer.text()
@@ -66,11 +71,12 @@ def _rounded(values: Any) -> Any:
 
 
 def car_columns(shots: StepRecord) -> dict[str, Float[np.ndarray, "T A"]]:
-    """Columns of `RESOLUTION`; a time to collision longer than MAX_TTC_S is missing (NaN)."""
-    columns = {"x": shots.position[..., 0], "y": shots.position[..., 1]}
-    columns |= {name: shots.action[..., i] for i, name in enumerate(("throttle", "turn", "brake"))}
-    columns |= {name: np.where(getattr(shots, name) <= MAX_TTC_S, getattr(shots, name), np.nan) for name in ("ttc", "edge_ttc")}
-    return {name: np.asarray(columns[name] if name in columns else getattr(shots, name), float) for name in RESOLUTION}
+    """Columns of `RESOLUTION` that are recorded; a time to collision longer than MAX_TTC_S is missing (NaN)."""
+    columns = {name: getattr(shots, name, None) for name in RESOLUTION} | {"x": shots.position[..., 0], "y": shots.position[..., 1]}
+    if shots.action is not None:
+        columns |= {name: shots.action[..., i] for i, name in enumerate(("throttle", "turn", "brake"))}
+    columns = {name: np.asarray(values, float) for name, values in columns.items() if values is not None}
+    return columns | {name: np.where(columns[name] <= MAX_TTC_S, columns[name], np.nan) for name in ("ttc", "edge_ttc") if name in columns}
 
 
 def _add_cars(packer: Packer, shots: StepRecord, active: Bool[np.ndarray, "T A"], shown: Int[np.ndarray, "T A"]) -> None:

@@ -5,9 +5,10 @@ The parts of `page/` and the data are joined to one document, whose content poli
 
 import html
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from importlib import resources
 from pathlib import Path
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
 import jax
@@ -21,7 +22,7 @@ from scenefactory_jax.visualization.web.term_styles import term_looks
 if TYPE_CHECKING:
     from IPython.display import HTML
 
-SCRIPTS = ("data.js", "state.js", "view.js", "road.js", "map.js", "charts.js", "rewards.js", "page.js")  # the last one starts the page
+SCRIPTS = ("data.js", "state.js", "view.js", "road.js", "map.js", "charts.js", "rewards.js", "failures.js", "page.js")  # the last starts
 
 
 class ReplayError(ValueError):
@@ -52,6 +53,8 @@ def document(
     posts: Sequence[RoadPosts] = (),
     title: str = "replay",
     goal_radius_m: float | int,
+    failures: Sequence[Mapping[int, Mapping[str, Any]]] = (),
+    metrics: Mapping[str, str] = MappingProxyType({}),
 ) -> str:
     """The page as text.
 
@@ -61,19 +64,23 @@ def document(
         posts: lights and stop signs of the worlds (`road_posts.find_posts`); empty: not shown.
         title: of the page.
         goal_radius_m: of the goals' circles.
+        failures: of each world, car -> metric -> [first, last] step of each failure, None for a metric without a value, and "counted" ->
+            [first, last] of the steps that count; empty: not shown.
+        metrics: name -> label of what fails.
 
     Raises:
-        ReplayError: another number of names or posts than of worlds, or an empty recording.
+        ReplayError: another number of names, posts or failures than of worlds, or an empty recording.
     """
     recording = jax.device_get(recording)
     count, steps = recording.shots.time_s.shape if recording.shots.time_s.ndim == 2 else (0, 0)
     if not count or not steps:
         raise ReplayError(f"recording: expected worlds along the first axis, of at least one step, got {count} worlds of {steps} steps")
-    for key, values in (("names", names), ("posts", posts)):
+    for key, values in (("names", names), ("posts", posts), ("failures", failures)):
         if values and len(values) != count:
             raise ReplayError(f"{key}: expected {count}, one per world, or none, got {len(values)}")
-    names, posts = names or [f"world {index}" for index in range(count)], posts or [RoadPosts()] * count
-    worlds = [replay_data.world(recording, index, name=names[index], posts=posts[index]) for index in range(count)]
+    names, posts, failures = names or [f"world {index}" for index in range(count)], posts or [RoadPosts()] * count, failures or [{}] * count
+    shown = zip(names, posts, failures, strict=True)
+    worlds = [replay_data.world(recording, i, name=name, posts=post, failures=marks) for i, (name, post, marks) in enumerate(shown)]
     head = {
         "title": title,
         "goal_radius_m": goal_radius_m,
@@ -81,6 +88,7 @@ def document(
         "marks": {name: {"label": mark.label, "colour": list(mark.colour)} for name, mark in MARKS.items()},
         "terms": {name: look._asdict() for name, look in term_looks(recording.shots.terms).items()},
         "max_ttc_s": replay_data.MAX_TTC_S,
+        "metrics": dict(metrics),
         "worlds": [world for world, _ in worlds],
     }
     arrays = "\n".join(f'<script type="text/plain" class="arrays">{text}</script>' for _, text in worlds)

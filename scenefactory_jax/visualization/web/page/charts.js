@@ -7,12 +7,13 @@ const charts = []; // those on the page: {plot, cursor, draw(), showValues(step)
 const line = (array, label, colour, dashed = false) => ({ array, label, colour, dashed });
 
 /** A chart of lines. Bounds: from `low` to `high`, or to the largest value and at least `least`. */
-function lineChart(title, unit, lines, options) {
+function lineChart(title, unit, wanted, options) {
+  const lines = wanted.filter(({ array }) => has(app.world, array));
   const spec = { low: 0, digits: 2, scale: 1, missing: "–", lines, ...options };
   const { arrays } = app.world; // of one value, zero: recordings have no actions, some worlds no contacts
   const isZero = lines.every(({ array }) => arrays[array].step === undefined && arrays[array].low === 0);
   const keys = (caption, car) => lineKeys(caption, spec, car);
-  return { title, unit, isZero, keys, draw: (picture, car) => drawLines(picture, spec, car) };
+  return { title, unit, isMissing: !lines.length, isZero, keys, draw: (picture, car) => drawLines(picture, spec, car) };
 }
 
 function chartsOf({ wheels }) {
@@ -24,7 +25,7 @@ function chartsOf({ wheels }) {
   return [
     lineChart("Speed", "m/s", [line("speed", "", BLUE)], { least: 5 }),
     lineChart("Actions", "", actions, { low: -1, high: 1 }),
-    { title: "Reward by term", unit: "a step", tall: true, keys: rewardKeys, draw: drawReward },
+    { title: "Reward by term", unit: "a step", tall: true, isMissing: !app.world.terms.length, keys: rewardKeys, draw: drawReward },
     lineChart("Time to collision", "s", times, { high: 10, cut: true, missing: `> ${replay.max_ttc_s}` }),
     wheels.length
       ? lineChart("Friction under each wheel", "μ", friction, { least: 0.5, digits: 3 })
@@ -41,7 +42,7 @@ function makeCharts() {
   $("charts").replaceChildren();
   charts.length = 0;
   if (!car) return;
-  const all = chartsOf(app.world);
+  const all = chartsOf(app.world).filter(({ isMissing }) => !isMissing);
   for (const { title, unit, isZero, tall, keys, draw } of all) {
     if (isZero) continue;
     const heading = element("b", { textContent: title }, element("small", { textContent: unit }));

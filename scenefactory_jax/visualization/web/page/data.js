@@ -52,6 +52,8 @@ function roadLines(world) {
 // ---- values of a world
 
 const read = (world, name, row, step) => world.array[name].values[row * world.array[name].columns + step];
+/** Whether a recording has a column: evaluations have no actions, rewards and wheels. */
+const has = (world, name) => name in world.array;
 const seconds = (world, step) => world.start + step * world.dt;
 const within = (spans, step) => spans.some(([first, last]) => step >= first && step <= last);
 

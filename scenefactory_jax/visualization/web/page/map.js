@@ -185,7 +185,7 @@ function drawCar(car) {
     pen.stroke();
     drawWindow(0.3, 0.34, 0.1, 0.41, 0.82, size); // the wide one shows the front
     drawWindow(-0.3, 0.36, -0.4, 0.3, 0.35, size);
-    if (!(read(app.world, "brake", slot, now()) > 0.1 && within(car.spans, now()))) return;
+    if (!(has(app.world, "brake") && read(app.world, "brake", slot, now()) > 0.1 && within(car.spans, now()))) return;
     pen.fillStyle = "#ff2d3d";
     for (const side of [0.3, -0.3]) pen.fillRect(-length / 2 - 0.05, (side - 0.16) * width, 0.3, 0.32 * width);
   });
@@ -204,7 +204,7 @@ function drawWheels({ slot, size: [length, width] }) {
   pen.fillStyle = dark.matches ? "#000" : "#15181c";
   for (const along of [0.31, -0.31])
     for (const across of [0.47, -0.47])
-      placed(along * length, across * width, along > 0 ? read(app.world, "steer", slot, now()) : 0, () => {
+      placed(along * length, across * width, along > 0 && has(app.world, "steer") ? read(app.world, "steer", slot, now()) : 0, () => {
         box(0.8, 0.34, 0.08);
         pen.fill();
       });

@@ -13,6 +13,7 @@ function draw() {
   }
   if (app.selected !== null) {
     showFacts();
+    showFailures();
     moveCursors();
   } else app.world.events.forEach((event, i) => $("events").children[i].firstChild.classList.toggle("future", event.step > now()));
 }
@@ -75,6 +76,7 @@ function showSelection() {
   const car = app.world.bySlot.get(app.selected);
   $("car").hidden = !car;
   $("overview").hidden = Boolean(car);
+  makeFailures();
   makeCharts();
   drawTimeline();
   $("cars").querySelector(`[data-car="${app.selected}"]`)?.scrollIntoView({ block: "nearest", inline: "nearest" });
@@ -95,11 +97,13 @@ function showFacts() {
   $("car").classList.toggle("over", !within(car.spans, now()));
   $("car-title").replaceChildren(`Car ${car.slot}`, element("small", { textContent: storyOf(car) }));
   const facts = [
-    ["speed", number(3.6 * value("speed"), 1), "km/h"],
-    ["steer", number((value("steer") * 180) / Math.PI, 1), "°"],
-    ["goal", number(value("goal_distance"), 1), "m"],
-    ["friction used", number(100 * value("friction_utilization"), 0), "%"],
-  ];
+    ["speed", "speed", 3.6, 1, "km/h"],
+    ["steer", "steer", 180 / Math.PI, 1, "°"],
+    ["goal", "goal_distance", 1, 1, "m"],
+    ["friction used", "friction_utilization", 100, 0, "%"],
+  ]
+    .filter(([, name]) => has(app.world, name))
+    .map(([title, name, scale, digits, unit]) => [title, number(scale * value(name), digits), unit]);
   $("facts").replaceChildren(
     ...facts.map(([name]) => element("dt", { textContent: name })),
     ...facts.map(([, text, unit]) => element("dd", { textContent: text }, element("small", { textContent: unit }))),
@@ -119,6 +123,7 @@ function drawTimeline() {
   bar(0, Math.max(app.world.end, 1), css("line"));
   const car = app.world.bySlot.get(app.selected);
   car?.spans.forEach(([first, last]) => bar(first, last, rgb(carColour(car.slot))));
+  if (car) failuresOf(car).forEach(({ first, last }) => bar(first, last, css("fail")));
   for (const chosen of [false, true])
     for (const { name, step } of app.world.events.filter((event) => (event.car === app.selected) === chosen))
       drawGlyph(brush, name, across(step), 11, chosen ? 7 : 4, rgb(eventColour(name), chosen ? 1 : 0.8));
@@ -138,6 +143,8 @@ const KEYS = {
   End: () => seek(app.world.end),
   e: () => toEvent(1),
   E: () => toEvent(-1),
+  m: () => toFailure(1),
+  M: () => toFailure(-1),
   n: () => cycle(1),
   p: () => cycle(-1),
   f: fit,
