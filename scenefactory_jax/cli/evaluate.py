@@ -13,6 +13,7 @@ from scenefactory_jax.cli import schema
 from scenefactory_jax.core import config as run_config
 from scenefactory_jax.core import trusted_targets
 from scenefactory_jax.core.config import flatten
+from scenefactory_jax.core.schema import read as read_settings
 from scenefactory_jax.data.loading import scene_source
 from scenefactory_jax.evaluation import protocols
 from scenefactory_jax.evaluation.protocols import Evaluator
@@ -23,7 +24,7 @@ from scenefactory_jax.visualization.report.evaluation_files import Result
 
 
 def evaluate(config: Mapping[str, Any]) -> Result:
-    """Evaluates a run as a config says (`load_config("evaluate", "run=...")`): deterministic policy, one episode a scene and repeat.
+    """Evaluates a run as a config says (`load_config("evaluate", "run=...")`), one episode a scene and repeat.
 
     Raises:
         ConfigError: no such run, no checkpoint in it, a setting that the run does not have, code of others without `trust`.
@@ -61,7 +62,10 @@ def _evaluate(
     settings: Mapping[str, Any],
     planners: Mapping[str, Mapping[str, Any]] = MappingProxyType({}),
 ) -> Result:
-    scenes = scene_source.load_heldout_scenes(config["scenes"], path=request["scenes"])
+    scores = settings.get("protocol", {}).get("scores")
+    scores = scores and read_settings(scores, ScoreSettings, where="protocol.scores")
+    keep_raw = bool(scores and scores.wosac)
+    scenes = scene_source.load_heldout_scenes(config["scenes"], path=request["scenes"], keep_raw=keep_raw)
     print(scenes.account, flush=True)
     policies = {"trained": checkpoint.restore_parameters(run / "checkpoints")}
     if settings["untrained"]:
@@ -69,8 +73,6 @@ def _evaluate(
     filmed_worlds = settings["video"]["worlds"] if settings["video"]["enable"] else 0
     recorded_worlds = None if settings["failures"]["pictures"]["enable"] else filmed_worlds
     terminations = load_terminations(request["protocols"])
-    scores = settings.get("protocol", {}).get("scores")
-    scores = scores and ScoreSettings(**scores)
     same = {"scenes": scenes, "terminations": terminations, "settings": settings, "scores": scores}
     run_protocols = functools.partial(protocols.evaluate_protocols, **same)
     evaluated = itertools.chain(

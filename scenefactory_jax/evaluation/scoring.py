@@ -48,9 +48,7 @@ def make_scorer(settings: ScoreSettings, *, control_dt: float) -> Callable[[Scen
     Raises:
         ConfigError: control steps of which a tenth of a second is no multiple.
     """
-    stride = round(STEP_S / control_dt)
-    if stride < 1 or abs(stride * control_dt - STEP_S) > 1e-6:
-        raise ConfigError(f"timing.control_hz: expected a multiple of {1 / STEP_S:g} for scores, got {1 / control_dt:g}")
+    stride = find_stride(control_dt)
 
     @jax.jit
     def score(scene: Scene, start: Start, frames: EpisodeFrame, limits: tuple[Array, Array]) -> dict[str, Array]:
@@ -63,6 +61,14 @@ def make_scorer(settings: ScoreSettings, *, control_dt: float) -> Callable[[Scen
         return jax.device_get(score(worlds, start, thinned, find_speed_limits(scene)))
 
     return score_all
+
+
+def find_stride(control_dt: float) -> int:
+    """Finds the number of control steps in STEP_S; ConfigError if it is no whole one."""
+    stride = round(STEP_S / control_dt)
+    if stride < 1 or abs(stride * control_dt - STEP_S) > 1e-6:
+        raise ConfigError(f"timing.control_hz: expected a multiple of {1 / STEP_S:g} for scores, got {1 / control_dt:g}")
+    return stride
 
 
 def find_speed_limits(scene: Scene) -> tuple[np.ndarray, np.ndarray]:

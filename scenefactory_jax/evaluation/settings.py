@@ -64,8 +64,16 @@ class Episodes:
 
 
 @dataclass(frozen=True)
+class WosacSettings:
+    """How all episodes of a scene are scored together (`evaluation.wosac`)."""
+
+    submission: bool  # the rollouts of each scene are written, in the shape of a submission
+
+
+@dataclass(frozen=True)
 class ScoreSettings:
     """How episodes are scored (`evaluation.scoring`)."""
 
     past_rows: Seed  # rows of the log before the start: with scenes.pack.log_from=start
     ends_at_failure: bool  # only states up to the first overlap, off-road state or red light count, as in V-Max's evaluation
+    wosac: WosacSettings | None = None  # WOSAC's realism of scenes in place of scores of agents

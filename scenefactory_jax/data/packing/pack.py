@@ -40,6 +40,7 @@ class PackReport:
     steps: int  # of the packed log
     current: int  # index in the packed log of the step at which the cars start
     track_ids: tuple[int, ...]  # of the agents, slot by slot
+    traffic_ids: tuple[int, ...]  # of the background traffic, row by row
     agents_kept: int
     agents_dropped: dict[str, int]  # reason of DROPS -> count
     traffic_kept: int  # a track is an agent, or counted here or in the next
@@ -53,6 +54,7 @@ class PackReport:
     relief_m: float  # height between the lowest and the highest kept road point: the packed scene is flat
     repairs: tuple[str, ...] = ()
     metadata: dict[str, Any] = field(default_factory=dict)
+    raw: RawScene | None = None  # the checked scene itself, where it is kept
 
 
 class Packed(NamedTuple):
@@ -134,6 +136,7 @@ def pack(
     report = PackReport(
         **_describe_source(raw, origin, centred_on, first),
         track_ids=tuple(raw.tracks[i].id for i in chosen),
+        traffic_ids=tuple(raw.tracks[i].id for i in others),
         agents_kept=int(leaves["agents.present"].sum()),
         agents_dropped=dropped if starts is None else dict.fromkeys(DROPS, 0),
         traffic_kept=len(beside["traffic_log.kind"]),

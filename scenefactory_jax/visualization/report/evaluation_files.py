@@ -8,12 +8,13 @@ import numpy as np
 
 from scenefactory_jax.core.trajectory import Trajectory
 from scenefactory_jax.evaluation import circumstances, episode_records, statistics
+from scenefactory_jax.evaluation.metrics import wosac_submission
 from scenefactory_jax.evaluation.protocols import Evaluated
 from scenefactory_jax.evaluation.records import Records, begin_folder, write_records
 from scenefactory_jax.evaluation.statistics import Estimate
 from scenefactory_jax.loggers import metrics_csv
 from scenefactory_jax.visualization.birds_eye import figures, video
-from scenefactory_jax.visualization.report import evaluation_report, failure_pictures, plots
+from scenefactory_jax.visualization.report import evaluation_report, failure_pictures, plots, score_table
 
 
 class Result(NamedTuple):
@@ -56,6 +57,8 @@ def write(
             begin_folder(out, {**request, "episodes": episodes, **{key: settings[key] for key in ("seed", "repeats", "untrained")}})
         records[label] = evaluation.records
         write_records(out / _agents_file(label), evaluation.records)
+        if evaluation.rollouts and settings["protocol"]["scores"]["wosac"]["submission"]:
+            wosac_submission.write_all(out / f"rollouts-{label.replace(', ', '-')}", evaluation.rollouts)
         if recording is None or evaluation.policy != "trained":
             continue
         if settings["video"]["enable"] and not trajectories:
@@ -67,6 +70,7 @@ def write(
     summary = {name: statistics.summarise(rows, bootstrap=settings["bootstrap"], seed=settings["seed"]) for name, rows in records.items()}
     metrics = metrics_csv.read(run)
     files = {f"Agents, {name}": out / _agents_file(name) for name in records}
+    files["Scores, all metrics"] = score_table.write(out, summary)
     files["Failures, ranked"] = failure_pictures.write(out, records, pictures)
     if metrics:
         files["Metrics of the training"] = run / metrics_csv.FILE
@@ -81,7 +85,7 @@ def write(
         episodes={"Protocol": f"`{request['protocol']}`", **episodes},
         command=command,
         figures=_draw_figures(out, metrics, records, summary, trajectories),
-        videos=_write_video(out, trajectories, settings["video"]) if trajectories else {},
+        videos=_write_video(out, trajectories, settings["video"], stochastic=settings.get("stochastic", False)) if trajectories else {},
         failure_pictures=pictures,
         files=files,
     )
@@ -123,7 +127,7 @@ def _draw_figures(
     return {caption: plots.save(figure, out / f"{name}.png") for caption, (figure, name) in drawn.items()}
 
 
-def _write_video(out: Path, trajectories: list[Trajectory], settings: Mapping[str, Any]) -> dict[str, Path]:
+def _write_video(out: Path, trajectories: list[Trajectory], settings: Mapping[str, Any], *, stochastic: bool) -> dict[str, Path]:
     path = video.write(out / f"video{settings['suffix']}", trajectories, **{key: settings[key] for key in video.SETTINGS})
     speed = settings["fps"] * settings["stride"] / trajectories[0].control_hz
-    return {f"Deterministic policy, {speed:g} x real time": path}
+    return {f"{'Stochastic' if stochastic else 'Deterministic'} policy, {speed:g} x real time": path}
