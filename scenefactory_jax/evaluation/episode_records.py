@@ -72,7 +72,7 @@ def make_episode_runner(
     control_hz = float(config["timing"]["control_hz"])
     realism = score = None
     if scores is not None and scores.wosac is not None:
-        realism = wosac.make_scorer(scenes, stride=scoring.find_stride(1 / control_hz))
+        realism = wosac.make_scorer(scenes, stride=scoring.find_stride(1 / control_hz), dynamics=config["dynamics"]["_target_"])
     elif scores is not None:
         score = scoring.make_scorer(scores, control_dt=1 / control_hz)
     drive = _make_driver(config, settings=settings, recorded_worlds=worlds if scores is None else count)

@@ -1,14 +1,15 @@
 """Scores of the Waymo Open Sim Agents Challenge for recorded episodes: joins the episodes of each scene to rollouts of all its objects.
 
 Every object that is valid at the current step is simulated for 8 s: agents by the policy, the others by the background traffic; an object
-that the simulation lacks follows its log. An object that leaves the simulation, or the log, keeps its last state. The simulation is flat:
-an object keeps the height that it has at the current step.
+that the simulation lacks follows its log. An object that leaves the simulation, or the log, goes straight on: those that kept their place
+would be hit by the others. The simulation is flat: an object keeps the height that it has at the current step.
 """
 
 from collections.abc import Callable, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
@@ -18,14 +19,15 @@ from scenefactory_jax.data.loading.scene_source import Scenes
 from scenefactory_jax.evaluation import wosac_scenes
 from scenefactory_jax.evaluation.episodes import EpisodeFrame
 from scenefactory_jax.evaluation.metrics import wosac_scores
-from scenefactory_jax.evaluation.metrics.wosac_features import HISTORY_STEPS, Objects
+from scenefactory_jax.evaluation.metrics.wosac_features import HISTORY_STEPS, Features, Objects
 from scenefactory_jax.evaluation.metrics.wosac_map_features import RoadMap
-from scenefactory_jax.evaluation.metrics.wosac_scores import CHALLENGES
+from scenefactory_jax.evaluation.metrics.wosac_scores import CHALLENGES, Challenge, SceneScores
 from scenefactory_jax.evaluation.metrics.wosac_submission import STEPS, SceneRollouts
 from scenefactory_jax.evaluation.wosac_scenes import NONE, LoggedScene, pad
 
 LATEST = max(CHALLENGES)  # whose likelihoods and buckets are shown
 NOW = HISTORY_STEPS - 1
+LOG_PLAYBACK = "scenefactory_jax.dynamics.log_playback.make"
 
 
 class Rollout(NamedTuple):
@@ -49,12 +51,13 @@ class RealismScorer(NamedTuple):
     score: Callable[[Sequence[list[Rollout]]], Realism]  # of all episodes
 
 
-def make_scorer(scenes: Scenes, *, stride: int) -> RealismScorer:
+def make_scorer(scenes: Scenes, *, stride: int, dynamics: str) -> RealismScorer:
     """Makes the functions for packed scenes.
 
     Args:
         scenes: with `reports`, as `scene_source.load_heldout_scenes(keep_raw=True)` loads them.
         stride: control steps in a tenth of a second.
+        dynamics: the `_target_` of the agents'; those that play their log back leave where it ends.
 
     Raises:
         ConfigError: no scene of WOMD's timing.
@@ -65,19 +68,20 @@ def make_scorer(scenes: Scenes, *, stride: int) -> RealismScorer:
     if not logged:
         raise ConfigError(f"protocol.scores.wosac: none of {len(found)} scenes can be scored: {', '.join({*map(str, found)})}")
     operands, capacity = wosac_scenes.pad_scenes(list(logged.values()))
+    leaving = agents if dynamics == LOG_PLAYBACK else 0
 
     def read_rollouts(frames: EpisodeFrame) -> list[Rollout]:
         thinned = jax.tree.map(lambda leaf: leaf[:, stride - 1 :: stride][:, :STEPS], frames)
         users = list_users(thinned, traffic)
-        return [simulate(scene, *(leaf[row] for leaf in users)) for row, scene in logged.items()]
+        return [simulate(scene, *(leaf[row] for leaf in users), leaving=leaving) for row, scene in logged.items()]
 
     def score(episodes: Sequence[list[Rollout]]) -> Realism:
         columns: dict[str, np.ndarray] = {}
         files = []
         for (row, scene), operand, parts in zip(logged.items(), operands, zip(*episodes, strict=True), strict=True):
             states = np.stack([rollout.state for rollout in parts])
-            scores = jax.device_get(score_scene(operand[0], pad(states, capacity, axis=1), *operand[1:]))
-            for name, value in (list_values(scores) | count_objects(scene, parts[0].simulated, agents)).items():
+            scores = jax.device_get(score_scene(operand[0], jax.device_put(pad(states, capacity, axis=1)), *operand[1:]))
+            for name, value in (list_values(*scores) | count_objects(scene, parts[0].simulated, agents)).items():
                 columns.setdefault(name, np.full(len(scenes), np.nan))[row] = value
             files.append(SceneRollouts(scene.name, scene.object_id, states, scene.origin))
         return Realism(columns, files)
@@ -90,8 +94,9 @@ def list_users(frames: EpisodeFrame, rows: int) -> tuple[Float[np.ndarray, "W F 
 
     Agents that an event ended stay where they are.
     """
-    traffic = frames.traffic
-    parts = [(frames.position, frames.yaw, np.ones_like(frames.active))]
+    frame: Any = frames  # on the host
+    traffic = frame.traffic
+    parts = [(frame.position, frame.yaw, np.ones_like(frame.active))]
     if traffic.yaw.shape[-1] == rows:
         parts.append((traffic.position, traffic.yaw, traffic.present))
     pose = np.concatenate([np.concatenate([position, yaw[..., None]], axis=-1) for position, yaw, _ in parts], axis=2)
@@ -99,46 +104,66 @@ def list_users(frames: EpisodeFrame, rows: int) -> tuple[Float[np.ndarray, "W F 
     return pose, present & np.isfinite(pose).all(axis=-1)
 
 
-def simulate(scene: LoggedScene, pose: Float[np.ndarray, "F U 3"], present: Bool[np.ndarray, "F U"]) -> Rollout:
-    """Gathers the future of a scene's objects from the users of one of its episodes, or from the log."""
-    pose, present = (np.swapaxes(leaf, 0, 1) for leaf in (pose, present))
-    simulated = (scene.slot != NONE) & (scene.slot < len(pose))
-    row = np.where(simulated, scene.slot, 0)
-    state, valid = scene.log.state[:, HISTORY_STEPS:], scene.log.valid[:, HISTORY_STEPS:]
-    own = np.broadcast_to(scene.log.state[:, NOW, None, 2:3], (*pose[row].shape[:2], 1))
-    driven = np.concatenate([pose[row][..., :2], own, wrap_angles(pose[row][..., 2:])], axis=-1)
-    fill = [(0, 0), (0, STEPS - driven.shape[1])]  # behind the end of an episode
-    driven, known = np.pad(driven, [*fill, (0, 0)]), np.pad(present[row], fill)
-    future, known = np.where(simulated[:, None, None], driven, state), np.where(simulated[:, None], known, valid)
-    states = np.concatenate([scene.log.state[:, NOW, None], future], axis=1)
-    last = np.maximum.accumulate(np.where(known, np.arange(1, STEPS + 1), 0), axis=1)
-    return Rollout(np.take_along_axis(states, last[..., None], axis=1).astype(np.float32), simulated)
+def simulate(scene: LoggedScene, pose: Float[np.ndarray, "F U 3"], present: Bool[np.ndarray, "F U"], *, leaving: int) -> Rollout:
+    """Gathers the future of a scene's objects from the users of one of its episodes, or from the log.
+
+    Args:
+        leaving: the first users leave behind the last valid step of their log.
+    """
+    simulated = (scene.slot != NONE) & (scene.slot < pose.shape[1])
+    rows, slots = np.flatnonzero(simulated), scene.slot[simulated]
+    state, known = scene.state.copy(), scene.valid.copy()
+    valid = known[rows, HISTORY_STEPS : HISTORY_STEPS + len(pose)]
+    logged = np.flip(np.logical_or.accumulate(np.flip(valid, axis=1), axis=1), axis=1)  # up to the last valid step
+    known[rows, HISTORY_STEPS:], end = False, HISTORY_STEPS + len(pose)
+    known[rows, HISTORY_STEPS:end] = present[:, slots].T & (logged | (slots >= leaving)[:, None])
+    own = np.swapaxes(pose[:, slots], 0, 1)
+    height = np.broadcast_to(state[rows, NOW, None, 2:3], (*own.shape[:2], 1))
+    state[rows, HISTORY_STEPS:end] = np.concatenate([own[..., :2], height, wrap_angles(own[..., 2:])], axis=-1)
+    return Rollout(extrapolate(state, known)[:, HISTORY_STEPS:], simulated)
+
+
+def extrapolate(state: Float[np.ndarray, "O T 4"], known: Bool[np.ndarray, "O T"]) -> Float[np.ndarray, "O T 4"]:
+    """Replaces the states that are not known: from the last known one, objects move on as from the one before it, if that is known, too;
+    else they stay. Height and yaw stay."""
+    steps = np.arange(known.shape[1])
+    last = np.maximum.accumulate(np.where(known, steps, 1), axis=1)
+    end, before = (np.take_along_axis(state, row[..., None], axis=1) for row in (last, last - 1))
+    moves = np.take_along_axis(known, last - 1, axis=1)[..., None] & (np.arange(4) < 2)
+    return (end + np.where(moves, end - before, 0.0) * (steps - last)[..., None]).astype(np.float32)
 
 
 @jax.jit
 def score_scene(
     log: Objects, rollouts: Float[Array, "R O F 4"], evaluated: Int[Array, " E"], kept: Bool[Array, " E"], vehicle: Bool[Array, " O"],
     road: RoadMap,
-) -> dict[int, wosac_scores.SceneScores]:  # fmt: skip
-    """Computes the scores of all years; the features, which they share, once. Arguments as those of `wosac_scores.score_rollouts`."""
+) -> tuple[dict[int, SceneScores], SceneScores]:  # fmt: skip
+    """Computes the scores of all years, with the features, which they share, once; and those of the log under as many copies of itself.
+
+    Arguments as those of `wosac_scores.score_rollouts`.
+    """
     features, simulated = wosac_scores.compute_all_features(log, rollouts, evaluated, road)
     counted = wosac_scores.find_counted(log, evaluated, kept, vehicle, road)
-    positions = log.state[evaluated, HISTORY_STEPS:, :3], rollouts[:, evaluated, :, :3]
-    return {
-        year: wosac_scores.compute_scene_scores(features, simulated, *positions, counted, challenge=challenge)
-        for year, challenge in CHALLENGES.items()
-    }
+    position, future = rollouts[:, evaluated, :, :3], log.state[evaluated, HISTORY_STEPS:, :3]
+    repeat = lambda leaf: jnp.broadcast_to(leaf, (len(rollouts), *leaf.shape))  # noqa: E731
+
+    def score(simulated: Features, position: Float[Array, "R E F 3"], challenge: Challenge) -> SceneScores:
+        return wosac_scores.compute_scene_scores(features, simulated, future, position, counted, challenge=challenge)
+
+    itself = score(jax.tree.map(repeat, features), repeat(future), CHALLENGES[LATEST])
+    return {year: score(simulated, position, challenge) for year, challenge in CHALLENGES.items()}, itself
 
 
-def list_values(scores: dict[int, wosac_scores.SceneScores]) -> dict[str, float]:
+def list_values(scores: dict[int, SceneScores], itself: SceneScores) -> dict[str, float]:
     """Lists the scores of a scene by the names of their columns; NaN where the scene does not determine one."""
     latest = scores[LATEST]
     named = {str(year): found.meta for year, found in scores.items()} | latest.buckets | latest.likelihoods
-    named |= {"ade_m": latest.ade, "min_ade_m": latest.min_ade} | {f"{name}_rate": rate for name, rate in latest.rates.items()}
+    named |= {"of_log": itself.meta, "ade_m": latest.ade, "min_ade_m": latest.min_ade}
+    named |= {f"{name}_rate": rate for name, rate in latest.rates.items()}
     return {f"wosac_{name}": float(score.value) if score.valid else np.nan for name, score in named.items()}
 
 
-def count_objects(scene: LoggedScene, simulated: Bool[np.ndarray, " O"], agents: int) -> dict[str, float]:
+def count_objects(scene: LoggedScene, simulated: Bool[np.ndarray, " O"], agents: int) -> dict[str, int | float]:
     """Counts the objects of a scene; and computes the parts of the evaluated ones that the policy drives, and that the simulation lacks."""
     slot, simulated = scene.slot[scene.evaluated], simulated[scene.evaluated]
     part = lambda mask: float(np.mean(mask)) if len(mask) else np.nan  # noqa: E731

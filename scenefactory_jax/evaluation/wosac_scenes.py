@@ -6,8 +6,9 @@ packed scene's centre, as simulated ones are.
 """
 
 from collections.abc import Sequence
-from typing import NamedTuple, TypeVar
+from typing import NamedTuple
 
+import jax
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
@@ -21,20 +22,38 @@ from scenefactory_jax.evaluation.metrics.wosac_submission import STEPS
 
 EVEN_S = 1e-3  # by which the step of a log may differ from DT_S
 NONE = -1  # slot of an object that the simulation lacks
-Row = TypeVar("Row")
+
+
+class Points(NamedTuple):
+    """Points of polylines, as `Lines`, without padding."""
+
+    position: Float[np.ndarray, "P 3"]
+    line: Int[np.ndarray, " P"]  # index into `RawScene.roads`
+
+
+class LoggedLights(NamedTuple):
+    """Lights, as `Lights`."""
+
+    lane: Int[np.ndarray, " L"]
+    state: Int[np.ndarray, "T L"]
+    stop: Float[np.ndarray, "L 3"]
 
 
 class LoggedScene(NamedTuple):
-    """A scene as WOSAC sees it: O objects that are valid at the current step, in the order of their tracks; numpy."""
+    """A scene as WOSAC sees it, on the host: O objects that are valid at the current step, in the order of their tracks."""
 
     name: str
     object_id: Int[np.ndarray, " O"]
-    log: Objects  # history and future, 91 steps; state relative to `origin`
+    state: Float[np.ndarray, "O T 4"]  # history and future, 91 steps; as in `Objects`, relative to `origin`
+    valid: Bool[np.ndarray, "O T"]
+    size: Float[np.ndarray, "O 3"]
     vehicle: Bool[np.ndarray, " O"]
     evaluated: Int[np.ndarray, " E"]  # rows of the recording car and of the tracks to predict
     missing: int  # tracks to predict that are not valid at the current step: they are not evaluated
     slot: Int[np.ndarray, " O"]  # among the agents, then the traffic, of the packed scene; or NONE
-    road: RoadMap
+    edges: Points
+    lanes: Points  # of surface streets
+    lights: LoggedLights  # that have a stop point
     origin: Float[np.ndarray, "3"]  # in the source's coordinates
 
 
@@ -56,18 +75,23 @@ def read_scene(report: PackReport, *, agents: int, traffic: int) -> LoggedScene 
     if len(set(ids)) < len(ids):
         return "two objects of one id"
     places = {name: agents + row for row, name in enumerate(report.traffic_ids[:traffic])} | _number(report.track_ids[:agents])
-    predicted, sdc = raw.metadata.get("tracks_to_predict", ()), raw.sdc
-    chosen = dict.fromkeys([*([raw.tracks[sdc].id] if sdc is not None else []), *predicted])  # each once, in this order
+    recording = [] if raw.sdc is None else [raw.tracks[raw.sdc].id]
+    chosen: dict[int, None] = dict.fromkeys([*recording, *raw.metadata.get("tracks_to_predict", ())])  # each once, in this order
     number = _number(ids)
+    state, valid, size = _read_log(raw, rows, origin)
     return LoggedScene(
         name=raw.name,
         object_id=np.array(ids, np.int64),
-        log=_read_log(raw, rows, origin),
+        state=state,
+        valid=valid,
+        size=size,
         vehicle=np.array([track.kind == "vehicle" for track in tracks], bool),
         evaluated=np.array([number[name] for name in chosen if name in number], np.int32),
         missing=sum(name not in number for name in chosen),
         slot=np.array([places.get(name, NONE) for name in ids], np.int32),
-        road=_read_road(raw, origin),
+        edges=_join_lines(raw.roads, EDGES, origin),
+        lanes=_join_lines(raw.roads, (LANE_STREET,), origin),
+        lights=_read_lights(raw, origin),
         origin=origin,
     )
 
@@ -83,22 +107,20 @@ def _find_fault(raw: RawScene) -> str | None:
     return None
 
 
-def _number(names: Sequence[Row]) -> dict[Row, int]:
+def _number(names: Sequence[int]) -> dict[int, int]:
     return {name: row for row, name in enumerate(names)}
 
 
-def _read_log(raw: RawScene, rows: list[int], origin: Float[np.ndarray, "3"]) -> Objects:
-    """The tracks over 91 steps; steps behind the log's end are not valid."""
+def _read_log(raw: RawScene, rows: list[int], origin: Float[np.ndarray, "3"]) -> tuple[np.ndarray, ...]:
+    """States of the tracks over 91 steps, which of them are valid, and sizes; steps behind the log's end are not valid."""
     logs, length = stack_tracks([raw.tracks[row] for row in rows], len(raw.times)), HISTORY_STEPS + STEPS
     state = np.concatenate([logs.xyz - origin, logs.yaw[..., None]], axis=-1)
     state = np.where(logs.valid[..., None], state, 0.0)[:, :length]
     behind = [(0, 0), (0, length - state.shape[1])]
-    valid = np.pad(logs.valid[:, :length], behind)
-    return Objects(np.pad(state, [*behind, (0, 0)]).astype(np.float32), valid, logs.size.astype(np.float32))
+    return np.pad(state, [*behind, (0, 0)]).astype(np.float32), np.pad(logs.valid[:, :length], behind), logs.size.astype(np.float32)
 
 
-def _read_road(raw: RawScene, origin: Float[np.ndarray, "3"]) -> RoadMap:
-    """Road edges, lanes of surface streets, and the lights that have a stop point; lines are numbered as in `RawScene.roads`."""
+def _read_lights(raw: RawScene, origin: Float[np.ndarray, "3"]) -> LoggedLights:
     number = {line.id: row for row, line in enumerate(raw.roads) if line.kind == LANE_STREET}
     lights = [light for light in raw.lights if light.stop is not None and light.lane in number]
     length = HISTORY_STEPS + STEPS
@@ -107,22 +129,18 @@ def _read_road(raw: RawScene, origin: Float[np.ndarray, "3"]) -> RoadMap:
         shown = np.where(light.valid, light.state, 0)[:length]
         states[: len(shown), column] = shown
     stop = np.array([light.stop for light in lights], np.float64).reshape(-1, 3) - origin
-    return RoadMap(
-        edges=_join_lines(raw.roads, EDGES, origin),
-        lanes=_join_lines(raw.roads, (LANE_STREET,), origin),
-        lights=Lights(np.array([number[light.lane] for light in lights], np.int32), states, stop.astype(np.float32)),  # pyright: ignore[reportArgumentType]
-    )
+    return LoggedLights(np.array([number[light.lane] for light in lights], np.int32), states, stop.astype(np.float32))
 
 
-def _join_lines(roads: Sequence[Polyline], kinds: tuple[int, ...], origin: Float[np.ndarray, "3"]) -> Lines:
+def _join_lines(roads: Sequence[Polyline], kinds: tuple[int, ...], origin: Float[np.ndarray, "3"]) -> Points:
     rows = [row for row, line in enumerate(roads) if line.kind in kinds]
     xyz = np.concatenate([np.zeros((0, 3)), *(roads[row].xyz for row in rows)]) - origin
     line = np.repeat(rows, [len(roads[row].xyz) for row in rows]).astype(np.int32)
-    return Lines(xyz.astype(np.float32), line, np.ones(len(line), bool))  # pyright: ignore[reportArgumentType]
+    return Points(xyz.astype(np.float32), line)
 
 
 def pad_scenes(scenes: Sequence[LoggedScene]) -> tuple[list[tuple], int]:
-    """Pads scenes to common sizes, so that one program scores them all.
+    """Pads scenes to common sizes, so that one program scores them all, and puts them onto the device.
 
     Returns:
         For each scene the log, the rows of evaluated objects, which of these are no padding, which objects are vehicles, and the road; and
@@ -130,18 +148,21 @@ def pad_scenes(scenes: Sequence[LoggedScene]) -> tuple[list[tuple], int]:
     """
     count = lambda of: max(1, *(of(scene) for scene in scenes))  # noqa: E731
     objects, evaluated = count(lambda scene: len(scene.object_id)), count(lambda scene: len(scene.evaluated))
-    edges, lanes = (count(lambda scene, part=part: len(getattr(scene.road, part).line)) for part in ("edges", "lanes"))
-    lights = count(lambda scene: len(scene.road.lights.lane))
+    edges, lanes = count(lambda scene: len(scene.edges.line)), count(lambda scene: len(scene.lanes.line))
+    lights = count(lambda scene: len(scene.lights.lane))
+    put = lambda *arguments, **axis: jax.device_put(pad(*arguments, **axis))  # noqa: E731
+    put_lines = lambda points, size: Lines(*(put(leaf, size) for leaf in (*points, np.ones(len(points.line), bool))))  # noqa: E731
     operands = []
     for scene in scenes:
-        log = Objects(*(pad(leaf, objects) for leaf in scene.log))
+        log = Objects(*(put(leaf, objects) for leaf in (scene.state, scene.valid, scene.size)))
+        lane, state, stop = scene.lights
         road = RoadMap(
-            Lines(*(pad(leaf, edges) for leaf in scene.road.edges)),
-            Lines(*(pad(leaf, lanes) for leaf in scene.road.lanes)),
-            Lights(pad(scene.road.lights.lane, lights), pad(scene.road.lights.state, lights, axis=1), pad(scene.road.lights.stop, lights)),
+            put_lines(scene.edges, edges),
+            put_lines(scene.lanes, lanes),
+            Lights(put(lane, lights), put(state, lights, axis=1), put(stop, lights)),
         )
-        kept = np.arange(evaluated) < len(scene.evaluated)
-        operands.append((log, pad(scene.evaluated, evaluated), kept, pad(scene.vehicle, objects), road))
+        kept = jax.device_put(np.arange(evaluated) < len(scene.evaluated))
+        operands.append((log, put(scene.evaluated, evaluated), kept, put(scene.vehicle, objects), road))
     return operands, objects
 
 

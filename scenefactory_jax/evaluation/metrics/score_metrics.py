@@ -54,6 +54,7 @@ WOSAC = {  # of scenes: each has its value in one row
         str(year): (f"Realism, WOSAC {year}", "", f"Weighted sum of the likelihoods of the log under a scene's rollouts; rules of {year}.")
         for year in (2025, 2024, 2023)
     },
+    "of_log": ("Realism of the log itself", "", "The same (2025) of the log under copies of itself, in which objects leave as logged."),
     "kinematic": ("Kinematic realism", "", "Weighted mean of the likelihoods of speeds and accelerations (WOSAC 2025)."),
     "interactive": ("Interactive realism", "", "Weighted mean of those of distance, collisions and time to collision (WOSAC 2025)."),
     "map": ("Map realism", "", "Weighted mean of those of the road edge and of red lights (WOSAC 2025)."),
