@@ -26,7 +26,7 @@ ALONE = ("scenes=town",)  # the environment of planners without a run
 
 
 def evaluate(config: Mapping[str, Any]) -> Result:
-    """Evaluates a run as a config says (`load_config("evaluate", "run=...")`): deterministic policy, one episode a scene and repeat.
+    """Evaluates a run as a config says (`load_config("evaluate", "run=...")`), one episode a scene and repeat.
 
     Without a run, planners alone are evaluated, in the default environment of towns with the protocol's settings.
 
@@ -72,14 +72,15 @@ def _evaluate(
     settings: Mapping[str, Any],
     planners: Mapping[str, Mapping[str, Any]] = MappingProxyType({}),
 ) -> Result:
-    scenes = scene_source.load_heldout_scenes(config["scenes"], path=request["scenes"])
+    scores = settings.get("protocol", {}).get("scores")
+    scores = scores and read_settings(scores, ScoreSettings, where="protocol.scores")
+    keep_raw = bool(scores and scores.wosac)
+    scenes = scene_source.load_heldout_scenes(config["scenes"], path=request["scenes"], keep_raw=keep_raw)
     print(scenes.account, flush=True)
     policies = {} if run is None else {"trained": checkpoint.restore_parameters(run / "checkpoints")}
     if settings["untrained"]:
         policies["untrained"] = policy_io.draw_untrained(config, scenes[0])
     terminations = load_terminations(request["protocols"])
-    scores = settings.get("protocol", {}).get("scores")
-    scores = scores and read_settings(scores, ScoreSettings, where="protocol.scores")
     shown_worlds = settings["replay_worlds"] if scores else 0
     filmed_worlds = max(shown_worlds, settings["video"]["worlds"] if settings["video"]["enable"] else 0)
     recorded_worlds = None if settings["failures"]["pictures"]["enable"] else filmed_worlds

@@ -57,6 +57,7 @@ class Protocol:
     mu: Positive | None = None  # friction coefficient of a suite whose settings read it
     scores: ScoreSettings | None = None  # how episodes are scored; null: they are not
     planner_overrides: dict[str, list[str]] = field(default_factory=dict)  # behind those of `evaluate`
+    stochastic: bool = False  # the policy's actions are sampled
 
 
 @dataclass(frozen=True)
@@ -74,6 +75,7 @@ class Evaluate(Episodes):
     trust: bool
     out: str | None
     overrides: list[str]
+    stochastic: bool
     untrained: bool
     replay_worlds: Seed
     planners: list[str]

@@ -351,7 +351,10 @@ class Env(NamedTuple):
 
 
 class Policy(NamedTuple):
-    """`apply(parameters, observation) -> (mean [..., 3], log_std [3], value [...])` for any leading axes."""
+    """`apply(parameters, observation) -> (mean [..., 3], log_std [3], value [...])` for any leading axes.
+
+    A logarithm of -inf is that of a policy without noise, as a planner.
+    """
 
     init: Callable[[PRNGKeyArray, Observation], Any]
     apply: Callable[[Any, Observation], tuple[Array, Array, Array]]

@@ -14,6 +14,7 @@ TRAFFIC = {
     "no_traffic": "none",
     "parked_traffic": "parked cars stand",
     "static_traffic": "all vehicles of the start stand",
+    "constant_traffic": "straight on at the velocity of the start, it does not react",
     "log_traffic": "as recorded, it does not react",
     "idm_traffic": "vehicles with a route drive and react (IDM), people and cyclists as recorded",
     "trajectory_idm_traffic": "as recorded, some vehicles react along their tracks (MetaDrive's IDM)",

@@ -1,6 +1,6 @@
 """Runs episodes of all scenes at once: records of every agent, and a recording of which single worlds can be drawn."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import jax
@@ -14,18 +14,23 @@ from scenefactory_jax.core.types import SURFACES, Boxes, Scene, State, Weather
 from scenefactory_jax.data.loading import scene_source
 from scenefactory_jax.env import environment
 from scenefactory_jax.env.rollout import RolloutState, rollout, start_rollout
-from scenefactory_jax.evaluation import episodes, failures, noisy_start, route_signals, scoring
+from scenefactory_jax.evaluation import episodes, failures, noisy_start, route_signals, scoring, wosac
 from scenefactory_jax.evaluation.failure_signals import FAILURE_EVENTS, Moment, SignalThresholds
+from scenefactory_jax.evaluation.metrics.wosac_submission import SceneRollouts
 from scenefactory_jax.evaluation.records import Records
 from scenefactory_jax.evaluation.route_signals import CourseThresholds
 from scenefactory_jax.evaluation.settings import ScoreSettings
+from scenefactory_jax.learning import gaussian
 from scenefactory_jax.learning.training_loop import make_policy
+
+ACTIONS = 2**31  # folded into the key of a world for that of its actions; a split has smaller numbers
+NOISE = ACTIONS + 1  # the same for that of a noisy start
 
 
 class Recording(NamedTuple):
-    """The first worlds of an evaluation, on the host: 41 bytes a slot and step, 29 bytes a road user of the traffic and step."""
+    """The first worlds of the first repeat, on the host: 41 bytes a slot and step, 29 bytes a road user of the traffic and step."""
 
-    batch: Scene  # of all worlds, on the device
+    batch: Scene  # of all worlds of a repeat, on the device
     frames: episodes.EpisodeFrame  # numpy, [W, T, ...]
     state: State  # of all worlds at the end
     weather: Weather  # at the start
@@ -35,6 +40,14 @@ class Recording(NamedTuple):
     failures: dict[str, np.ndarray] | None  # of scored episodes, as `scoring.Scores` has them
 
 
+class Run(NamedTuple):
+    """The episodes of one policy."""
+
+    records: dict[str, np.ndarray]
+    recording: Recording | None
+    rollouts: list[SceneRollouts] | None  # of scenes that WOSAC scores
+
+
 def make_episode_runner(
     config: Mapping[str, Any],
     scenes: scene_source.Scenes,
@@ -42,44 +55,75 @@ def make_episode_runner(
     settings: Mapping[str, Any],
     worlds: int | None,
     scores: ScoreSettings | None = None,
-) -> Callable[[Any], tuple[dict[str, np.ndarray], Recording | None]]:
-    """Returns a function parameters -> (records, recording) that runs one deterministic episode for every scene and repeat.
+) -> Callable[[Any], Run]:
+    """Returns a function of parameters that runs one episode for every scene and repeat, one repeat after the other.
 
-    It compiles when it is first called, and not again for other parameters.
+    World w + i n is scene w of n in repeat i. Each has a key of its own, so that equal settings give equal records. The function compiles
+    when it is first called, and not again for other parameters.
 
     Args:
         config: its group `termination` is the protocol.
-        worlds: how many of the worlds to record; None: all.
+        settings: `stochastic`: the policy's actions are sampled; otherwise, and without it, they are its means.
+        worlds: how many of the worlds of the first repeat to record; None: all.
         scores: how episodes are scored; None: they are not.
     """
-    index = np.tile(np.arange(len(scenes)), settings["repeats"])
-    names = [scenes.names[i] for i in index]
-    batch = jax.device_put(jax.tree.map(lambda leaf: np.asarray(leaf)[index], scenes.scene))
-    keys = jax.random.split(jax.random.key(settings["seed"]), len(index))
-    worlds = len(index) if worlds is None else min(worlds, len(index))
+    count, repeats = len(scenes), settings["repeats"]
+    batch = jax.device_put(scenes.scene)
+    keys = jax.random.split(jax.random.key(settings["seed"]), repeats * count).reshape(repeats, count)
+    worlds = count if worlds is None else min(worlds, count)
     control_hz = float(config["timing"]["control_hz"])
-    score = None if scores is None else scoring.make_scorer(scores, config, recorded_worlds=worlds)
-    begun = batch  # the worlds at the start
-    if scores is not None and scores.noise is not None:
-        noise_keys = jax.vmap(jax.random.fold_in, in_axes=(0, None))(keys, 1)
-        begun = noisy_start.perturb_starts(noise_keys, batch, scores.noise, past_rows=scores.past_rows)
-    drive = _make_driver(config, settings=settings, recorded_worlds=worlds if score is None else len(index))
+    noise = None if scores is None else scores.noise
+    realism = score = None
+    if scores is not None and scores.wosac is not None:
+        realism = wosac.make_scorer(scenes, stride=scoring.find_stride(1 / control_hz), dynamics=config["dynamics"]["_target_"])
+    elif scores is not None:
+        score = scoring.make_scorer(scores, config, recorded_worlds=worlds)
+    drive = _make_driver(config, settings=settings, recorded_worlds=worlds if scores is None else count)
 
-    def run(parameters):
-        driven, failing = drive(parameters, begun, keys), None
-        first, state, frames = driven.first, driven.last, driven.frames
-        records = _make_all_columns(driven.metrics, first, state, driven.distance, names, settings=settings, control_hz=control_hz)
-        records |= {name: column[index[records["world"]], records["agent"]] for name, column in scenes.agent_columns.items()}
-        if score and frames is not None:
-            values, failing = score(batch, scoring.Start(first.agents, first.motion, driven.first_traffic, begun.log), frames)
-            records |= {name: column[records["world"], records["agent"]] for name, column in values.items()}
-        if not worlds:
-            return records, None
-        recorded = jax.tree.map(lambda leaf: leaf[:worlds], frames)
-        goal_radius_m = float(config["step_metrics"]["goal_radius_m"])
-        return records, Recording(batch, recorded, state, first.weather, names, control_hz, goal_radius_m, failing)
+    def run_repeat(parameters: Any, repeat: int) -> tuple[dict[str, np.ndarray], Recording | None, list[wosac.Rollout] | None]:
+        begun, failing = batch, None  # the worlds at the start
+        if scores is not None and noise is not None:
+            noise_keys = jax.vmap(jax.random.fold_in, in_axes=(0, None))(keys[repeat], NOISE)
+            begun = noisy_start.perturb_starts(noise_keys, batch, noise, past_rows=scores.past_rows)
+        driven = drive(parameters, begun, keys[repeat])
+        records = _make_all_columns(driven, scenes.names, keys[repeat], settings=settings, control_hz=control_hz)
+        here = records["world"], records["agent"]
+        records |= {name: column[here] for name, column in scenes.agent_columns.items()}
+        if score and driven.frames is not None:
+            start = scoring.Start(driven.first.agents, driven.first.motion, driven.first_traffic, begun.log)
+            values, failing = score(batch, start, driven.frames)
+            records |= {name: column[here] for name, column in values.items()}
+        rollouts = realism.read_rollouts(driven.frames) if realism and driven.frames is not None else None
+        recording = _make_recording(driven, batch, scenes.names, config, worlds, failing) if worlds and repeat == 0 else None
+        return records | {"world": records["world"] + repeat * count}, recording, rollouts
+
+    def run(parameters: Any) -> Run:
+        tables, recordings, rollouts = zip(*(run_repeat(parameters, repeat) for repeat in range(repeats)), strict=True)
+        records = {name: np.concatenate([table[name] for table in tables]) for name in tables[0]}
+        if realism is None:
+            return Run(records, recordings[0], None)
+        columns, files = realism.score(rollouts)
+        return Run(records | _spread_scenes(columns, records["world"]), recordings[0], files)
 
     return run
+
+
+def _spread_scenes(columns: Mapping[str, np.ndarray], world: np.ndarray) -> dict[str, np.ndarray]:
+    """Puts the values of scenes into the first row of each, so that means over rows are means over scenes; NaN in the other rows."""
+    worlds, first = np.unique(world, return_index=True)
+    spread = {name: np.full(len(world), np.nan) for name in columns}
+    for name, column in columns.items():
+        has_value = worlds < len(column)  # the first repeat
+        spread[name][first[has_value]] = column[worlds[has_value]]
+    return spread
+
+
+def _make_recording(
+    driven: "_Driven", batch: Scene, names: Sequence[str], config: Mapping[str, Any], worlds: int, failing: dict[str, np.ndarray] | None
+) -> Recording:
+    recorded = jax.tree.map(lambda leaf: leaf[:worlds], driven.frames)
+    numbers = float(config["timing"]["control_hz"]), float(config["step_metrics"]["goal_radius_m"])
+    return Recording(batch, recorded, driven.last, driven.first.weather, list(names), *numbers, failing)
 
 
 class _Driven(NamedTuple):
@@ -105,8 +149,9 @@ def _make_driver(
     limits = {"thresholds": SignalThresholds(**thresholds["signals"]), "course": CourseThresholds(**thresholds["course"])}
     hook = episodes.make_hook(env, ttc_limit_s=settings["ttc_limit_s"], control_dt=1 / control_hz, **limits)
 
-    def act(parameters, observation, _):
-        return policy.apply(parameters, observation)[0]
+    def act(parameters, observation, key):
+        mean, log_std, _ = policy.apply(parameters, observation)
+        return gaussian.sample(key, mean, log_std) if settings.get("stochastic", False) else mean
 
     @jax.jit
     def start(keys, batch):
@@ -115,21 +160,22 @@ def _make_driver(
         begun = jax.vmap(lambda state: start_rollout(state, episodes.make_metrics(state)))(states)
         return jax.tree.map(jnp.copy, begun), traffic  # to donate
 
-    def run_chunk(parameters, scene, episode: RolloutState):
-        return rollout(env, act, parameters, scene, episode, jax.random.key(0), steps=chunk, hook=hook)
+    def run_chunk(parameters, scene, key, number, episode: RolloutState):
+        key = jax.random.fold_in(jax.random.fold_in(key, ACTIONS), number)
+        return rollout(env, act, parameters, scene, episode, key, steps=chunk, hook=hook)
 
-    def run_chunks(parameters, batch, episode):
-        episode, frames = jax.vmap(run_chunk, in_axes=(None, 0, 0))(parameters, batch, episode)
+    def run_chunks(parameters, batch, keys, number, episode):
+        episode, frames = jax.vmap(run_chunk, in_axes=(None, 0, 0, None, 0))(parameters, batch, keys, number, episode)
         return episode, jax.tree.map(lambda leaf: leaf[:recorded_worlds], frames)
 
-    run_chunks = jax.jit(run_chunks, donate_argnums=2)
+    run_chunks = jax.jit(run_chunks, donate_argnums=4)
 
     def drive(parameters: Any, batch: Scene, keys: Array) -> _Driven:
         episode, traffic = start(keys, batch)
         first, distance, traffic = jax.device_get((episode.state, episode.carry.goal_distance, traffic))
         chunks = []
-        for _ in range(0, limit, chunk):
-            episode, frames = run_chunks(parameters, batch, episode)
+        for number in range(-(-limit // chunk)):
+            episode, frames = run_chunks(parameters, batch, keys, number, episode)
             if recorded_worlds:
                 chunks.append(jax.device_get(frames))
             if bool(episode.world_done.all()):
@@ -142,26 +188,26 @@ def _make_driver(
 
 
 def _make_all_columns(
-    metrics: episodes.EpisodeMetrics,
-    first: State,
-    last: State,
-    distance: np.ndarray,
-    names: list[str],
-    *,
-    settings: Mapping[str, Any],
-    control_hz: float,
+    driven: _Driven, names: Sequence[str], keys: Array, *, settings: Mapping[str, Any], control_hz: float
 ) -> dict[str, np.ndarray]:
-    """Returns the records with the columns of routes and of failures."""
+    """Returns the records with the columns of seeds, of routes and of failures."""
     thresholds, course = settings["failures"], CourseThresholds(**settings["failures"]["course"])
-    records = _make_records(metrics, first, distance, names, seed=settings["seed"], control_hz=control_hz)
+    first, metrics = driven.first, driven.metrics
+    records = _make_records(metrics, first, driven.distance, names, seed=settings["seed"], control_hz=control_hz)
+    records["episode_seed"] = _format_keys(keys)[records["world"]]
     route = jax.tree.map(lambda leaf: leaf[records["world"], records["agent"]], metrics.route)
     records |= route_signals.make_columns(route, records, course=course, control_hz=control_hz)
-    signals = _make_signals(metrics, last, np.asarray(first.agents.present), control_hz)
+    signals = _make_signals(metrics, driven.last, np.asarray(first.agents.present), control_hz)
     return records | failures.classify({**records, **signals}, failures.TypeThresholds(**thresholds["types"]))
 
 
+def _format_keys(keys: Array) -> np.ndarray:
+    """The seed of each key as a hexadecimal number: `jax.random.key` of it is that key, with 64 bits enabled."""
+    return np.array(["0x" + "".join(f"{word:08x}" for word in key) for key in np.asarray(jax.random.key_data(keys)).tolist()])
+
+
 def _make_records(
-    metrics: episodes.EpisodeMetrics, first: State, distance: np.ndarray, names: list[str], *, seed: int, control_hz: float
+    metrics: episodes.EpisodeMetrics, first: State, distance: np.ndarray, names: Sequence[str], *, seed: int, control_hz: float
 ) -> dict[str, np.ndarray]:
     """Returns one row for every spawned agent of every world; film and surface are those of the open road at the start."""
     world, agent = np.nonzero(first.agents.present)

@@ -13,6 +13,7 @@ from scenefactory_jax.data.loading import scene_source
 from scenefactory_jax.env import environment
 from scenefactory_jax.evaluation import episode_records, statistics
 from scenefactory_jax.evaluation.episode_records import Recording, Records
+from scenefactory_jax.evaluation.metrics.wosac_submission import SceneRollouts
 from scenefactory_jax.evaluation.settings import ScoreSettings
 from scenefactory_jax.loggers import metrics_csv
 
@@ -26,6 +27,7 @@ class Evaluated(NamedTuple):
     policy: str
     records: Records
     recording: Recording | None
+    rollouts: list[SceneRollouts] | None
     digest: str  # of what decides the episodes, but for scenes and weights
 
     @property
@@ -50,7 +52,7 @@ def evaluate_protocols(
         config: of the environment and the network, resolved.
         policies: name -> parameters of the config's network.
         terminations: protocol -> config of the group `termination`.
-        settings: `seed`, `repeats`, `chunk_steps`, `ttc_limit_s` and `failures`, as `conf/evaluate.yaml` has them.
+        settings: `seed`, `repeats`, `stochastic`, `chunk_steps`, `ttc_limit_s` and `failures`, as `conf/command/evaluate.yaml` has them.
         recorded_worlds: how many worlds of the first protocol are recorded; None: all worlds of all protocols.
         scores: how episodes are scored; None: they are not.
     """
@@ -59,15 +61,16 @@ def evaluate_protocols(
         task = {**config, "termination": termination}
         run = episode_records.make_episode_runner(task, scenes, settings=settings, worlds=worlds, scores=scores)
         parts = {name: task[name] for name in (*environment.GROUPS, "policy")} | {"pack": task["scenes"]["pack"]}
-        parts |= {"seed": settings["seed"], "repeats": settings["repeats"], "scores": scores and dataclasses.asdict(scores)}
+        parts |= {name: settings.get(name, False) for name in ("seed", "repeats", "stochastic")}
+        parts |= {"scores": scores and dataclasses.asdict(scores)}
         for policy, parameters in policies.items():
             yield Evaluated(protocol, policy, *run(parameters), result_file.digest(parts))
 
 
 def make_evaluator(config: Mapping[str, Any], scenes: scene_source.Scenes, *, settings: Mapping[str, Any]) -> Evaluator:
-    """`episode_records.make_episode_runner` without a recording."""
+    """`episode_records.make_episode_runner`, records alone."""
     run = episode_records.make_episode_runner(config, scenes, settings=settings, worlds=0)
-    return lambda parameters: run(parameters)[0]
+    return lambda parameters: run(parameters).records
 
 
 def make_training_callback(

@@ -12,7 +12,8 @@ from scenefactory_jax.core import column_table, result_file
 Records = Mapping[str, np.ndarray]  # column -> one value for every agent
 RESULT = "evaluation.json"  # settings of the evaluation, beside the records
 FILES = (RESULT, "agents-*.csv", "agents-*.parquet", "comparison-*.png", "failures.json", "failures-*", "learning.png", "outcomes.png")
-FILES += ("planners.*", "replay-*.html", "safety.png", "trajectories.png", "video.gif", "video.mp4", "report.md")  # of an evaluation
+FILES += ("planners.*", "replay-*.html", "rollouts-*/*.npz", "safety.png", "scores.csv", "trajectories.png", "video.gif", "video.mp4")
+FILES += ("report.md",)  # of an evaluation's folder
 ROUTE_EVENTS = ("red_light", "stop_sign", "off_route")  # records of before routes lack them: no agent had such an event
 EVENTS = ("numerical_error", "goal_reached", "collision", "out_of_bounds", "road_edge_contact", *ROUTE_EVENTS)
 COLUMNS: dict[str, type] = {  # further columns are kept and may serve a breakdown

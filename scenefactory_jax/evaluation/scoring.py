@@ -70,9 +70,7 @@ def make_scorer(
         ConfigError: control steps of which a tenth of a second is no multiple.
     """
     control_hz, mass = float(config["timing"]["control_hz"]), float(config["dynamics"]["contact"]["mass"])
-    stride, surrogates = round(STEP_S * control_hz), schema.read(config["step_metrics"], StepMetricsConfig, where="step_metrics")
-    if stride < 1 or abs(stride / control_hz - STEP_S) > 1e-6:
-        raise ConfigError(f"timing.control_hz: expected a multiple of {1 / STEP_S:g} for scores, got {control_hz:g}")
+    stride, surrogates = find_stride(1 / control_hz), schema.read(config["step_metrics"], StepMetricsConfig, where="step_metrics")
     score = make_program(dataclasses.replace(settings, noise=None), surrogates, mass, recorded_worlds)
 
     def score_all(scene: Scene, start: Start, frames: EpisodeFrame) -> Scores:
@@ -116,6 +114,14 @@ def make_program(settings: ScoreSettings, surrogates: StepMetricsConfig, mass: f
         return values, {name: mask[:recorded_worlds] for name, mask in failures.items()}
 
     return score
+
+
+def find_stride(control_dt: float) -> int:
+    """Finds the number of control steps in STEP_S; ConfigError if it is no whole one."""
+    stride = round(STEP_S / control_dt)
+    if stride < 1 or abs(stride * control_dt - STEP_S) > 1e-6:
+        raise ConfigError(f"timing.control_hz: expected a multiple of {1 / STEP_S:g} for scores, got {1 / control_dt:g}")
+    return stride
 
 
 def find_speed_limits(scene: Scene) -> tuple[np.ndarray, np.ndarray]:

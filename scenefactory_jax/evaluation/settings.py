@@ -76,6 +76,13 @@ class NoisyStart:
 
 
 @dataclass(frozen=True)
+class WosacSettings:
+    """How all episodes of a scene are scored together (`evaluation.wosac`)."""
+
+    submission: bool  # the rollouts of each scene are written, in the shape of a submission
+
+
+@dataclass(frozen=True)
 class ScoreSettings:
     """How episodes are scored (`evaluation.scoring`)."""
 
@@ -83,3 +90,4 @@ class ScoreSettings:
     ends_at_failure: bool  # only states up to the first overlap, off-road state or red light count, as in V-Max's evaluation
     vehicle_kg_per_m2: Positive  # mass of a vehicle of the traffic over its length x width, for delta-v
     noise: NoisyStart | None = None  # before the start; null: as recorded
+    wosac: WosacSettings | None = None  # WOSAC's realism of scenes in place of scores of agents

@@ -1,7 +1,13 @@
 """Diagonal Gaussians over actions."""
 
+import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, PRNGKeyArray
+
+
+def sample(key: PRNGKeyArray, mean: Float[Array, "*batch D"], log_std: Float[Array, " D"]) -> Float[Array, "*batch D"]:
+    """Samples actions; where a deviation is 0 (its logarithm -inf), the mean."""
+    return mean + jnp.exp(log_std) * jax.random.normal(key, mean.shape, mean.dtype)
 
 
 def log_probability(

@@ -29,7 +29,7 @@ from scenefactory_jax.env.termination import EventName, Termination
 from scenefactory_jax.env.traffic.idm import SIDE_M
 from scenefactory_jax.env.traffic.log_playback import VEHICLE, Row, is_parked, make_masses, make_stateless, read_log
 from scenefactory_jax.env.traffic.mixed import make_absent_boxes
-from scenefactory_jax.learning import policy_io
+from scenefactory_jax.learning import gaussian, policy_io
 from scenefactory_jax.learning.policy_io import TrainedPolicy
 from scenefactory_jax.learning.training_loop import make_policy
 from scenefactory_jax.weather.road_condition import keep_condition
@@ -196,7 +196,7 @@ def make_actor(trained: TrainedPolicy, env: Env, *, sample: bool) -> Actor:
 
     def compute(scene: Scene, world: State, key: PRNGKeyArray) -> Float[Array, "V 3"]:
         mean, log_std, _ = policy.apply(trained.parameters, env.observe(scene, world))
-        return mean + jnp.exp(log_std) * jax.random.normal(key, mean.shape, mean.dtype) if sample else mean
+        return gaussian.sample(key, mean, log_std) if sample else mean
 
     def skip(scene: Scene, world: State, key: PRNGKeyArray) -> Float[Array, "V 3"]:
         return jnp.zeros((len(world.active), 3), jnp.float32)

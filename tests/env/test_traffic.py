@@ -136,6 +136,19 @@ def test_static_keeps_the_parked_where_they_stood():
     assert not first.velocity.any() and not first.yaw_rate.any() and np.isinf(first.mass).all()
 
 
+def test_constant_goes_on_as_at_the_start():
+    slow, person = track([30.0, 0.0], (0.02, 0.0)), track([60.0, 0.0], (0.0, 1.2), kind="pedestrian")
+    drives, hidden = track([40.0, 0.0], (0.6, 0.0)), track([50.0, 0.0], valid=[False] + [True] * 20)
+    scene = with_tracks(scene_of([[0, 0]], [[50, 0]]), slow, drives, hidden, person)
+    first, late = at(scene, "constant", 0), at(scene, "constant", 900)  # 30 s, ten times the log
+    assert first.present.tolist() == late.present.tolist() == [True, True, False, True]
+    velocity = np.asarray(scene.traffic_log.velocity[:, 0])
+    assert np.linalg.norm(velocity[0]) < 0.3 < np.linalg.norm(velocity[1])
+    expected = np.asarray(first.position) + 30.0 * velocity * [[0], [1], [0], [1]]
+    np.testing.assert_allclose(np.asarray(late.position)[[0, 1, 3]], expected[[0, 1, 3]], rtol=1e-5)
+    np.testing.assert_array_equal(late.yaw, first.yaw)
+
+
 def test_padding_and_empty_logs_are_nobody():
     scene = scene_of([[0, 0]], [[50, 0]])
     for name in ("parked", "log_playback"):

@@ -127,7 +127,7 @@ def played(tmp_path_factory, settings):
         env = environment.make_env(config)
         observation = jax.jit(env.reset)(jax.random.key(0), scenes[0])[1]
         parameters = jax.jit(make_policy(config).init)(jax.random.key(1), observation)
-        return episode_records.make_episode_runner(config, scenes, settings=settings, worlds=None)(parameters)
+        return episode_records.make_episode_runner(config, scenes, settings=settings, worlds=None)(parameters)[:2]
 
 
 def row_of(records, name, agent=0) -> int:

@@ -113,7 +113,7 @@ def pack(
     tracks = [raw.tracks[i] for i in chosen]
     leaves = columns.with_subsets(road) | _agents(tracks, raw, origin, agents, car_size_m, start_speed)
     leaves |= _log(tracks, raw, origin, agents, first) | {"weather.film_mm": np.zeros(()), "weather.surface": np.zeros(())}
-    beside, traffic_dropped = _others(raw, chosen, leaves, origin, half, first, traffic, min_traffic_size_m)
+    beside, others, traffic_dropped = _others(raw, chosen, leaves, origin, half, first, traffic, min_traffic_size_m)
     stops = control_columns.pack_controls(raw, origin, half, controls)
     leaves |= beside | stops.columns | route_columns.make_no_routes(agents, len(beside["traffic_log.kind"]))
     leaves |= route_conflicts.make_no_zones(len(beside["traffic_log.kind"]))
@@ -125,6 +125,7 @@ def pack(
         steps=len(raw.times) - first,
         current=raw.current - first,
         track_ids=tuple(track.id for track in tracks),
+        traffic_ids=tuple(raw.tracks[i].id for i in others),
         agents_kept=len(tracks),
         agents_dropped=dropped,
         traffic_kept=len(beside["traffic_log.kind"]),
@@ -312,7 +313,7 @@ def _others(raw, agents, leaves, origin, half, first, limit, least):
     rows = _recording(tracks, raw, origin, len(tracks), first)
     rows["size"] = np.maximum(np.array([track.size[:2] for track in tracks], float).reshape(-1, 2), least)
     rows["kind"] = np.array([ROAD_USERS.index(track.kind) for track in tracks], int)
-    return {f"traffic_log.{name}": leaf for name, leaf in rows.items()}, dropped
+    return {f"traffic_log.{name}": leaf for name, leaf in rows.items()}, chosen, dropped
 
 
 def lists(midpoint, valid, origin, *, side, radius_m, size_m):

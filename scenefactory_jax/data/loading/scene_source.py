@@ -22,7 +22,7 @@ from scenefactory_jax.data.bank import bank_index, bank_reader, shard_files
 from scenefactory_jax.data.formats import reader_selection
 from scenefactory_jax.data.loading.scenes_config import check_config
 from scenefactory_jax.data.packing import friction_use
-from scenefactory_jax.data.packing.pack import Packed, prepare
+from scenefactory_jax.data.packing.pack import Packed, PackReport, prepare
 from scenefactory_jax.data.packing.stack import describe, stack
 from scenefactory_jax.data.packing.summary import Summary, shorten_path, summarise_packed
 from scenefactory_jax.data.packing.summary import describe as describe_summary
@@ -242,6 +242,7 @@ class Scenes:
     names: tuple[str, ...]
     account: str
     agent_columns: Mapping[str, np.ndarray] = field(default_factory=dict)  # numbers of the agents for tables, [W, A]
+    reports: tuple[PackReport, ...] = ()  # with the scenes as their source has them, where these are kept
 
     def __len__(self) -> int:
         return len(self.names)
@@ -261,17 +262,25 @@ def load_training_scenes(config: Mapping[str, Any]) -> Scenes:
     return take_scenes(load_all_scenes(config), config)
 
 
-def load_all_scenes(config: Mapping[str, Any]) -> Scenes:
-    """Loads the scenes that `scenes.take` samples from."""
-    source = open_source(config)
-    packed, summary = pack_all(source, **make_packing(config), workers=config["workers"], count=config["count"])
+def load_all_scenes(config: Mapping[str, Any], *, keep_raw: bool = False) -> Scenes:
+    """Loads the scenes that `scenes.take` samples from; `keep_raw`: with their sources."""
+    source, packing = open_source(config), make_packing(config)
+    if keep_raw:
+        packing["pack"] = functools.partial(_keep_raw, pack=packing["pack"])
+    packed, summary = pack_all(source, **packing, workers=config["workers"], count=config["count"])
     lines = [source.description, *describe_summary(summary)]
     if not packed:
         raise ConfigError(f"scenes.path={config['path']}: no usable scene\n" + "\n".join(lines[1:]))
     scene, cuts = stack([one.scene for one in packed], capacity=config["capacity"])
     names = tuple(escape_for_terminal(one.report.name) for one in packed)
     scene, added = friction_use.spread_uses(scene, config["pack"].get("starts"))
-    return Scenes(attach_grids(scene, config), names, "\n".join([*lines, *describe(cuts)]), added)
+    reports = tuple(one.report for one in packed) if keep_raw else ()
+    return Scenes(attach_grids(scene, config), names, "\n".join([*lines, *describe(cuts)]), added, reports)
+
+
+def _keep_raw(raw: RawScene, *, pack: Pack) -> tuple[Scene, PackReport]:
+    scene, report = pack(raw)
+    return scene, replace(report, raw=raw)
 
 
 def take_scenes(scenes: Scenes, config: Mapping[str, Any]) -> Scenes:
@@ -286,11 +295,12 @@ def take_scenes(scenes: Scenes, config: Mapping[str, Any]) -> Scenes:
     scene = jax.tree.map(lambda leaf: np.asarray(leaf)[chosen], scenes.scene)
     account = f"{scenes.account}\n{len(chosen)} of the {len(scenes)} scenes, drawn with seed {seed}"
     added = {name: column[chosen] for name, column in scenes.agent_columns.items()}
-    return Scenes(scene, tuple(scenes.names[index] for index in chosen), account, added)
+    names, reports = (tuple(column[index] for index in chosen) if column else () for column in (scenes.names, scenes.reports))
+    return Scenes(scene, names, account, added, reports)
 
 
-def load_heldout_scenes(config: Mapping[str, Any], *, path: str | None) -> Scenes:
-    """Loads scenes that training does not use: those at `path`, or those of `scenes.heldout`."""
+def load_heldout_scenes(config: Mapping[str, Any], *, path: str | None, keep_raw: bool = False) -> Scenes:
+    """Loads scenes that training does not use: those at `path`, or those of `scenes.heldout`; `keep_raw`: with their sources."""
     check_config(config)
     heldout = config["heldout"]
     path = path if path is not None else heldout["path"]
@@ -298,7 +308,7 @@ def load_heldout_scenes(config: Mapping[str, Any], *, path: str | None) -> Scene
         if not has_heldout(config):
             raise ConfigError("scenes.heldout.path: null; give held-out scenes here, or scenes.path=... to `evaluate`")
         check_heldout(config)
-    return load_all_scenes({**config, "path": path, "seed": heldout["seed"], "count": heldout["count"]})
+    return load_all_scenes({**config, "path": path, "seed": heldout["seed"], "count": heldout["count"]}, keep_raw=keep_raw)
 
 
 def check_heldout(config: Mapping[str, Any]) -> None:

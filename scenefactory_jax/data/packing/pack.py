@@ -40,6 +40,7 @@ class PackReport:
     steps: int  # of the packed log
     current: int  # index in the packed log of the step at which the cars start
     track_ids: tuple[int, ...]  # of the agents, slot by slot
+    traffic_ids: tuple[int, ...]  # of the background traffic, row by row
     agents_kept: int
     agents_dropped: dict[str, int]  # reason of DROPS -> count
     traffic_kept: int  # a track is an agent, or counted here or in the next
@@ -53,6 +54,7 @@ class PackReport:
     relief_m: float  # height between the lowest and the highest kept road point: the packed scene is flat
     repairs: tuple[str, ...] = ()
     metadata: dict[str, Any] = field(default_factory=dict)
+    raw: RawScene | None = None  # the checked scene itself, where it is kept
 
 
 class Packed(NamedTuple):
@@ -132,8 +134,7 @@ def pack(
     if require_agents and not leaves["agents.present"].any():
         raise Unpackable("no_agent_left", f"{raw.source}: roads: no room for a start of scenes.pack.starts")
     report = PackReport(
-        **_describe_source(raw, origin, centred_on, first),
-        track_ids=tuple(raw.tracks[i].id for i in chosen),
+        **_describe_source(raw, origin, centred_on, first, agents=chosen, traffic=others),
         agents_kept=int(leaves["agents.present"].sum()),
         agents_dropped=dropped if starts is None else dict.fromkeys(DROPS, 0),
         traffic_kept=len(beside["traffic_log.kind"]),
@@ -153,7 +154,9 @@ def _list_drops(dropped: dict[str, int]) -> str:
     return ", ".join(f"{count} {reason}" for reason, count in dropped.items() if count) or "no tracks"
 
 
-def _describe_source(raw: RawScene, origin: Float[np.ndarray, "3"], centred_on: str, first: int) -> dict[str, Any]:
+def _describe_source(
+    raw: RawScene, origin: Float[np.ndarray, "3"], centred_on: str, first: int, *, agents: list[int], traffic: list[int]
+) -> dict[str, Any]:
     """The entries of a report that say where a packed scene comes from."""
     return {
         "name": raw.name,
@@ -162,6 +165,8 @@ def _describe_source(raw: RawScene, origin: Float[np.ndarray, "3"], centred_on: 
         "centred_on": centred_on,
         "steps": len(raw.times) - first,
         "current": raw.current - first,
+        "track_ids": tuple(raw.tracks[i].id for i in agents),
+        "traffic_ids": tuple(raw.tracks[i].id for i in traffic),
         "metadata": dict(raw.metadata),
     }
 

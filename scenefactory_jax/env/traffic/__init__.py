@@ -11,6 +11,7 @@ from scenefactory_jax.core.instantiate import instantiate
 from scenefactory_jax.core.schema import Bounds, ConfigError, check_names, read_value
 from scenefactory_jax.core.types import Traffic
 from scenefactory_jax.env.traffic.idm import idm_traffic as idm_traffic
+from scenefactory_jax.env.traffic.log_playback import constant_traffic as constant_traffic
 from scenefactory_jax.env.traffic.log_playback import log_traffic as log_traffic
 from scenefactory_jax.env.traffic.log_playback import no_traffic as no_traffic
 from scenefactory_jax.env.traffic.log_playback import parked_traffic as parked_traffic

@@ -1,4 +1,4 @@
-"""Background traffic that does not react: none, parked vehicles, and road users that follow their log.
+"""Background traffic that does not react: none, parked vehicles, and road users that follow their log or go straight on.
 
 Logged traffic neither brakes nor swerves for a car, and a collision does not move it.
 """
@@ -67,6 +67,43 @@ def read_parked(scene: Scene, *, parked_m: float | None, start_row: int, elevati
     )
 
 
+def constant_traffic(
+    *,
+    kinds: list[RoadUser],
+    stand_mps: NonNegative,
+    mass_kg: dict[RoadUser, float | None],
+    start_row: Row,
+    elevation_m: float,
+    control_dt: float,
+) -> Traffic:
+    """Road users of these kinds that are on the road at the start; they keep the velocity and the heading that they have there.
+
+    Args:
+        stand_mps: slower ones stand.
+        mass_kg, start_row, elevation_m: as in `log_traffic`.
+    """
+    masses = make_masses(mass_kg)
+
+    def read(scene: Scene, step: Int[Array, ""]) -> Boxes:
+        log = scene.traffic_log
+        row = min(start_row, log.valid.shape[1] - 1)
+        zero = jnp.zeros_like(log.yaw[:, row])
+        moves = jnp.sum(log.velocity[:, row] ** 2, axis=-1) >= stand_mps**2
+        velocity = jnp.where(moves[:, None], log.velocity[:, row], 0.0)
+        return Boxes(
+            position=log.position[:, row] + step.astype(jnp.float32) * control_dt * velocity,
+            elevation=zero + elevation_m,
+            yaw=log.yaw[:, row],
+            velocity=velocity,
+            yaw_rate=zero,
+            size=log.size,
+            mass=jnp.array(masses, jnp.float32)[log.kind],
+            present=log.valid[:, row] & is_of_kinds(log, kinds),
+        )
+
+    return make_stateless(read)
+
+
 def log_traffic(
     *,
     kinds: list[RoadUser],
@@ -132,13 +169,18 @@ def read_log(
         yaw_rate=yaw_rate,
         size=log.size,
         mass=jnp.array(masses, jnp.float32)[log.kind],
-        present=started & (at_row | bridged | parked) & jnp.array([kind in kinds for kind in ROAD_USERS])[log.kind],
+        present=started & (at_row | bridged | parked) & is_of_kinds(log, kinds),
     )
     return replace(
         boxes,
         velocity=jnp.where(parked[:, None], 0.0, boxes.velocity),
         yaw_rate=jnp.where(parked, 0.0, boxes.yaw_rate),
     )
+
+
+def is_of_kinds(log: TrafficLog, kinds: list[RoadUser]) -> Bool[Array, " O"]:
+    """Mask of road users of these kinds."""
+    return jnp.array([kind in kinds for kind in ROAD_USERS])[log.kind]
 
 
 def is_parked(log: TrafficLog, within_m: float) -> Bool[Array, " O"]:

@@ -44,6 +44,35 @@ SCORES = {  # in the order of reports: label, unit, definition
 }  # fmt: skip
 
 
+LIKELIHOODS = {  # of the log under the rollouts of a scene, by feature
+    "linear_speed": "speed", "linear_acceleration": "acceleration", "angular_speed": "yaw rate", "angular_acceleration": "yaw acceleration",
+    "distance_to_nearest_object": "distance to others", "collision": "collisions", "time_to_collision": "time to collision",
+    "distance_to_road_edge": "distance to the road edge", "offroad": "leaving the road", "light_violation": "running red lights",
+}  # fmt: skip
+WOSAC = {  # of scenes: each has its value in one row
+    **{
+        str(year): (f"Realism, WOSAC {year}", "", f"Weighted sum of the likelihoods of the log under a scene's rollouts; rules of {year}.")
+        for year in (2025, 2024, 2023)
+    },
+    "of_log": ("Realism of the log itself", "", "The same (2025) of the log under copies of itself, in which objects leave as logged."),
+    "kinematic": ("Kinematic realism", "", "Weighted mean of the likelihoods of speeds and accelerations (WOSAC 2025)."),
+    "interactive": ("Interactive realism", "", "Weighted mean of those of distance, collisions and time to collision (WOSAC 2025)."),
+    "map": ("Map realism", "", "Weighted mean of those of the road edge and of red lights (WOSAC 2025)."),
+    **{
+        name: (f"Likelihood, {what}", "", f"Likelihood of the log's {what} under a scene's rollouts (WOSAC 2025).")
+        for name, what in LIKELIHOODS.items()
+    },
+    "min_ade_m": ("minADE", "m", "Average displacement error of a scene's best rollout, in space; steps of the history count as 0."),
+    "ade_m": ("ADE", "m", "Average displacement error of all rollouts of a scene."),
+    "collision_rate": ("Simulated collisions", FRACTION, "Evaluated objects that collide, of all rollouts."),
+    "offroad_rate": ("Simulated off-road", FRACTION, "Evaluated objects that leave the road, of all rollouts."),
+    "light_violation_rate": ("Simulated red-light runs", FRACTION, "Evaluated vehicles that run a red light, of all rollouts."),
+    "driven": ("Evaluated and driven", FRACTION, "Evaluated objects that the policy drives; the others are background traffic."),
+    "unsimulated": ("Evaluated, not simulated", FRACTION, "Evaluated objects that the simulation lacks: they follow their log."),
+}
+SCORES |= {f"wosac_{name}": entry for name, entry in WOSAC.items()}
+
+
 def _read(name: str) -> Callable[[Records], np.ndarray]:
     return lambda records: np.nan_to_num(np.asarray(records.get(name, np.full(len(records["scene"]), np.nan)), float))
 

@@ -9,6 +9,7 @@ A file is called SCENARIO_ID.npz and holds:
 The challenge's own files are protocol buffers (`SimAgentsChallengeSubmission`); this one is read without its library.
 """
 
+from collections.abc import Iterable
 from pathlib import Path
 from typing import NamedTuple
 
@@ -59,6 +60,13 @@ def write_rollouts(folder: Path | str, scene: SceneRollouts) -> Path:
     with write_atomically(path) as part, part.open("wb") as file:
         np.savez_compressed(file, **columns)
     return path
+
+
+def write_all(folder: Path, scenes: Iterable[SceneRollouts]) -> None:
+    """Writes the rollouts of scenes to a folder, which is made."""
+    folder.mkdir(exist_ok=True)
+    for scene in scenes:
+        write_rollouts(folder, scene)
 
 
 def read_rollouts(path: Path | str) -> SceneRollouts:

@@ -31,6 +31,6 @@ def make(*, trackers: dict[str, Tracker], dynamics: dict[str, Any] | None = None
         require_groups(observation, "planning", planner="constant", option="planning")
         speed = observation["planning"].velocity[..., 0]
         zero = jnp.zeros_like(speed)
-        return tracker.make_action(zero, zero, speed, car), jnp.zeros(3), zero
+        return tracker.make_action(zero, zero, speed, car), jnp.full(3, -jnp.inf), zero
 
     return Policy(init, apply)

@@ -58,7 +58,7 @@ def make(
             acceleration, curvature = compute_inverse_action(heading, view.velocity, view.next.yaw, view.next.velocity, dt=action_s)
         action = tracker.make_action(acceleration, curvature, speed, car)
         action = jnp.where(view.valid[..., None], action, tracker.make_braking_action(speed, car))
-        return action, jnp.zeros(3), jnp.zeros_like(speed)
+        return action, jnp.full(3, -jnp.inf), jnp.zeros_like(speed)
 
     return Policy(init, apply)
 

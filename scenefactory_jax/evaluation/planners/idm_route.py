@@ -59,7 +59,7 @@ def make(
         demand = idm_law.compute_interaction(speed, gap, leader_speed, law)
         demand = jnp.maximum(demand, idm_law.compute_interaction(speed, line, jnp.zeros_like(line), law))
         acceleration = jnp.maximum(idm_law.compute_acceleration(speed, target, demand, law), -max_braking_mps2)
-        return route_tracking.make_action(acceleration, route, speed, tracker), jnp.zeros(3), jnp.zeros_like(speed)
+        return route_tracking.make_action(acceleration, route, speed, tracker), jnp.full(3, -jnp.inf), jnp.zeros_like(speed)
 
     return Policy(init, apply)
 

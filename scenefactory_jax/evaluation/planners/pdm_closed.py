@@ -73,7 +73,7 @@ def make(
         acceleration, curvature = (leaf.reshape(speed.shape) for leaf in jax.vmap(drive)(flat))
         action = tracker.make_action(acceleration, curvature, speed, car)
         action = jnp.where(view.line.known[..., None], action, tracker.make_braking_action(speed, car))
-        return action, jnp.zeros(3), jnp.zeros_like(speed)
+        return action, jnp.full(3, -jnp.inf), jnp.zeros_like(speed)
 
     return Policy(init, apply)
 

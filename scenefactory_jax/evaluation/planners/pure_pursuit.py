@@ -49,6 +49,6 @@ def make(
         steer = jnp.where(cosine > 0.0, compute_steer(2.0 * sine / distance_m, tracker), jnp.copysign(1.0, sine))
         throttle = (speed_mps - speed_scale_mps * ego[..., 5]) / speed_band_mps
         mean = jnp.stack([throttle, steer, -jnp.ones_like(steer)], axis=-1)
-        return jnp.clip(mean, -1.0, 1.0), jnp.zeros(3), jnp.zeros_like(steer)
+        return jnp.clip(mean, -1.0, 1.0), jnp.full(3, -jnp.inf), jnp.zeros_like(steer)
 
     return Policy(init, apply)

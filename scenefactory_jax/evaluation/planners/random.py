@@ -22,6 +22,6 @@ def make() -> Policy:
         require_groups(observation, "noise", planner="random", option="noise")
         throttle, steer = observation["noise"][..., 0], observation["noise"][..., 1]
         action = jnp.stack([throttle, steer, jnp.where(throttle < 0, -throttle, -1.0)], axis=-1)
-        return action, jnp.zeros(3), jnp.zeros_like(throttle)
+        return action, jnp.full(3, -jnp.inf), jnp.zeros_like(throttle)
 
     return Policy(init, apply)

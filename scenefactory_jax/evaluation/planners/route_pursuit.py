@@ -44,6 +44,6 @@ def make(
         speed = observations["ego"]["speed_scale_mps"] * observation["ego"][..., 5]
         target = route_tracking.compute_target_speed(route, jnp.full_like(route.limit, speed_mps), tracker)
         action = route_tracking.make_action((target - speed) / response_s, route, speed, tracker)
-        return action, jnp.zeros(3), jnp.zeros_like(speed)
+        return action, jnp.full(3, -jnp.inf), jnp.zeros_like(speed)
 
     return Policy(init, apply)

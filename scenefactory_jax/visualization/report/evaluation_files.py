@@ -8,12 +8,13 @@ import numpy as np
 
 from scenefactory_jax.core.trajectory import Trajectory
 from scenefactory_jax.evaluation import circumstances, episode_records, statistics
+from scenefactory_jax.evaluation.metrics import wosac_submission
 from scenefactory_jax.evaluation.protocols import Evaluated
 from scenefactory_jax.evaluation.records import Records, begin_folder, name_file, write_records
 from scenefactory_jax.evaluation.statistics import Estimate
 from scenefactory_jax.loggers import metrics_csv
 from scenefactory_jax.visualization.birds_eye import figures, video
-from scenefactory_jax.visualization.report import evaluation_report, failure_pictures, planner_table, plots
+from scenefactory_jax.visualization.report import evaluation_report, failure_pictures, planner_table, plots, score_table
 from scenefactory_jax.visualization.web import episode_page
 
 
@@ -60,6 +61,8 @@ def write(
         if recording is not None and recording.failures is not None and (shown := settings["replay_worlds"]):
             page = out / f"replay-{label.replace(', ', '-')}.html"
             pages[f"Episodes, {label}"] = episode_page.write(page, recording, evaluation.records, worlds=shown)
+        if evaluation.rollouts and settings["protocol"]["scores"]["wosac"]["submission"]:
+            wosac_submission.write_all(out / f"rollouts-{label.replace(', ', '-')}", evaluation.rollouts)
         if recording is None or evaluation.policy != "trained":
             continue
         if settings["video"]["enable"] and not trajectories:
@@ -71,6 +74,7 @@ def write(
     summary = {name: statistics.summarise(rows, bootstrap=settings["bootstrap"], seed=settings["seed"]) for name, rows in records.items()}
     metrics = metrics_csv.read(run) if run else []
     files = {f"Agents, {name}": out / name_file(name) for name in records} | pages
+    files["Scores, all metrics"] = score_table.write(out, summary)
     files["Failures, ranked"] = failure_pictures.write(out, records, pictures)
     if rows := planner_table.select_policies(summary):
         files["Planners and metrics"] = planner_table.write(out, rows, records)
@@ -87,7 +91,7 @@ def write(
         episodes={"Protocol": f"`{request['protocol']}`", **episodes},
         command=command,
         figures=_draw_figures(out, metrics, records, summary, trajectories),
-        videos=_write_video(out, trajectories, settings["video"]) if trajectories else {},
+        videos=_write_video(out, trajectories, settings["video"], stochastic=settings.get("stochastic", False)) if trajectories else {},
         failure_pictures=pictures,
         files=files,
     )
@@ -139,7 +143,7 @@ def _draw_figures(
     return {caption: plots.save(figure, out / f"{name}.png") for caption, (figure, name) in drawn.items()}
 
 
-def _write_video(out: Path, trajectories: list[Trajectory], settings: Mapping[str, Any]) -> dict[str, Path]:
+def _write_video(out: Path, trajectories: list[Trajectory], settings: Mapping[str, Any], *, stochastic: bool) -> dict[str, Path]:
     path = video.write(out / f"video{settings['suffix']}", trajectories, **{key: settings[key] for key in video.SETTINGS})
     speed = settings["fps"] * settings["stride"] / trajectories[0].control_hz
-    return {f"Deterministic policy, {speed:g} x real time": path}
+    return {f"{'Stochastic' if stochastic else 'Deterministic'} policy, {speed:g} x real time": path}

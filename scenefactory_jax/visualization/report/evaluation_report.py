@@ -56,7 +56,7 @@ def write(
     return document.write(
         folder / "report.md",
         f"# {title}",
-        _headline(first, summary[first], records[first]),
+        _headline(first, summary[first], records[first], stochastic=settings.get("stochastic", False)),
         document.section("Episodes", markdown.format_table(["", ""], list(episodes.items())) if episodes else ""),
         document.section("Results", *_results({name: summary[name] for name in trained | rows}, trained | rows)),
         document.section("Comparison", *(_compare(name, summary, records, resampling) for name in trained if name + UNTRAINED in records)),
@@ -80,7 +80,7 @@ def write(
     )
 
 
-def _headline(name: str, summary: Summary, records: Records) -> str:
+def _headline(name: str, summary: Summary, records: Records, *, stochastic: bool) -> str:
     reached, agents = int(np.sum(records["goal_reached"])), len(records["scene"])
     scenes, success, clean = len(np.unique(records["scene"])), summary["success_rate"], summary["clean_success_rate"]
     what = f"{reached} of {agents} cars reached their goal ({format_estimate(success)}), {format_estimate(clean)} without any other event"
@@ -89,7 +89,8 @@ def _headline(name: str, summary: Summary, records: Records) -> str:
         what = f"{agents} cars: {', '.join(scores)}"
     parts = [
         f"**{what}** (protocol: {name}).",
-        f"{document.count(scenes, 'scene')}, {document.count(_count_episodes(records), 'episode')}; deterministic policy; "
+        f"{document.count(scenes, 'scene')}, {document.count(_count_episodes(records), 'episode')}; "
+        f"{'stochastic' if stochastic else 'deterministic'} policy; "
         f"seeds {_list_seeds(records)}.",
         "Numbers in brackets are 95 % intervals: were the evaluation repeated on other scenes of this kind, the true rate would lie "
         "inside an interval made this way 19 times of 20.",

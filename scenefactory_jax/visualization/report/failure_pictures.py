@@ -6,9 +6,12 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from scenefactory_jax.core.trajectory import Trajectory
 from scenefactory_jax.evaluation import episode_records, failures
 from scenefactory_jax.evaluation.failures import FAILURE_TYPES, Failure
+from scenefactory_jax.evaluation.records import select_rows
 from scenefactory_jax.visualization.birds_eye import video
 from scenefactory_jax.visualization.birds_eye.failure_figures import Case, failures_figure
 from scenefactory_jax.visualization.report import plots
@@ -19,7 +22,8 @@ _AFTER_S = 2.0  # of a film, after the failure
 def draw(
     out: Path, label: str, records: episode_records.Records, recording: episode_records.Recording, settings: Mapping[str, Any]
 ) -> dict[str, Path]:
-    """Draws the worst failures of every type that occurred; returns type -> picture, and "film" -> film if the settings ask for one."""
+    """Draws the worst failures of every type that was recorded; returns type -> picture, and "film" -> film if the settings ask for one."""
+    records = select_rows(records, np.asarray(records["world"]) < len(recording.frames.active))
     numbers, stem = settings["failures"]["pictures"], label.replace(", ", "-")
     ranked = failures.rank_failures(records)
     trajectory = functools.cache(functools.partial(episode_records.trajectory, recording))
