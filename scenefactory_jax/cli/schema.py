@@ -103,6 +103,7 @@ class Train(Task):
     loggers: Group
     scenes: Group
     policy: Group
+    learner: Group
     ppo: Group
     stream: Group | None
     evaluation: TrainEvaluation
@@ -168,6 +169,7 @@ class Benchmark(Task):
     loggers: Group
     scenes: Group
     policy: Group
+    learner: Group
     ppo: Group
     stream: Group | None
     baseline: Baseline | None

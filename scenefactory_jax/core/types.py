@@ -351,7 +351,11 @@ class Env(NamedTuple):
 
 
 class Policy(NamedTuple):
-    """`apply(parameters, observation) -> (mean [..., 3], log_std [3], value [...])` for any leading axes."""
+    """`apply(parameters, observation) -> (mean [..., 3], log_std [3], value [...])` for any leading axes.
+
+    A deviation may depend on the observation: log_std [..., 3].
+    """
 
     init: Callable[[PRNGKeyArray, Observation], Any]
     apply: Callable[[Any, Observation], tuple[Array, Array, Array]]
+    networks: Any = None  # `learning.networks.squashed.Networks` of the learners that need more than `apply`
