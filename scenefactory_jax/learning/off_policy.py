@@ -10,7 +10,7 @@ are observed. It is so neither taken for a termination nor for a step into the n
 
 import dataclasses
 import functools
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple, TypeVar
 
 import jax
@@ -62,7 +62,7 @@ class OffPolicyConfig:
 
 
 class Learnt(NamedTuple):
-    """What updates change: fields of the train state."""
+    """What updates change. The train state has the parameters once, and the other fields by the names of its learners."""
 
     parameters: Any
     learner: Any
@@ -82,12 +82,14 @@ class Learner(NamedTuple):
 class Rounds(NamedTuple):
     """The constants of all iterations of one learner."""
 
+    name: str  # of the learner: its key in the train state, and the first part of its metrics' names
     env: Env
     learner: Learner
     config: OffPolicyConfig
     axis: str | None  # mesh axis of the devices, inside `shard_map`; None: one device
     shards: int  # groups of worlds of all devices
     devices: int
+    key: str = "buffer"  # of the config, with the buffer's size
 
 
 class Progress(NamedTuple):
@@ -195,86 +197,68 @@ def make_transition_rows(transitions: Transition, *, numbers: int, storage: Stor
     return rows, valid
 
 
-def train_iteration(rounds: Rounds, name: str, train_state: TrainState, scenes: Scene) -> tuple[TrainState, Metrics]:
-    """Computes one iteration of a single learner."""
+def train_iteration(rounds: Rounds, train_state: TrainState, scenes: Scene) -> tuple[TrainState, Metrics]:
+    """Computes one iteration: its rounds, the next train state and its metrics."""
+    name, axis = rounds.name, rounds.axis
     run_key, key = jax.random.split(train_state.key)
-    learnt = Learnt(train_state.parameters, train_state.learner, train_state.optimizer)
-    learnt, buffer, worlds, progress = run_rounds(rounds, learnt, train_state.buffer, train_state.worlds, scenes, run_key)
-    metrics = {f"{name}/{key}": value for key, value in compute_metrics(rounds, progress, buffer).items()}
-    return advance(rounds, train_state, learnt, buffer, worlds, key, progress, metrics)
-
-
-def compute_metrics(rounds: Rounds, progress: Progress, buffer: Buffer) -> Metrics:
-    """Computes means of the updates' metrics over those that were finite; `skipped`: number of the others; `lost`: part of the samples
-    that was not stored, because the time limit cut it short or a number was not finite; `buffer`: rows that are stored."""
-    sums = dict(progress.sums)
-    changed, skipped = sums.pop("changed"), sums.pop("skipped")
-    counts = sharding.sum_over_devices(progress.counts, rounds.axis)
-    return {
-        **{name: value / jnp.maximum(changed, 1.0) for name, value in sums.items()},
-        "updates": changed,
-        "skipped": skipped,
-        "lost": counts["lost"] / jnp.maximum(counts["lost"] + counts["stored"], 1),
-        "buffer": replay_buffer.count_rows(buffer, axis=rounds.axis).astype(jnp.float32),
-    }
-
-
-def advance(
-    rounds: Rounds,
-    train_state: TrainState,
-    learnt: Learnt,
-    buffer: Any,
-    worlds: Worlds,
-    key: PRNGKeyArray,
-    progress: Progress,
-    metrics: Metrics,
-) -> tuple[TrainState, Metrics]:
-    """Makes the next train state, and adds the metrics of the rounds' steps."""
-    counts = sharding.sum_over_devices(progress.counts, rounds.axis)
-    scene_stats = sharding.gather_over_devices(progress.scene_stats, rounds.axis)
-    updates = jnp.sum(jnp.stack([value for name, value in metrics.items() if name.endswith("/updates")]))
+    learnt = Learnt(train_state.parameters, train_state.learner[name], train_state.optimizer[name])
+    buffer, worlds = train_state.buffer[name], train_state.worlds
+    learnt, buffer, worlds, progress = run_rounds(rounds, learnt, buffer, worlds, scenes, run_key)
+    counts = sharding.sum_over_devices(progress.counts, axis)
+    scene_stats = sharding.gather_over_devices(progress.scene_stats, axis)
     train_state = replace(
         train_state,
-        **learnt._asdict(),
-        buffer=buffer,
+        parameters=learnt.parameters,
+        learner=train_state.learner | {name: learnt.learner},
+        optimizer=train_state.optimizer | {name: learnt.optimizer},
+        buffer=train_state.buffer | {name: buffer},
         worlds=worlds,
         scene_stats=jax.tree.map(jnp.add, train_state.scene_stats, scene_stats),
         key=key,
         iteration=train_state.iteration + 1,
         steps=trainer.add_steps(train_state.steps, counts["spawned"]),
     )
+    updates = progress.sums["changed"] + progress.sums["skipped"]
     steps = {"steps/updates": updates, "steps/samples": updates * rounds.config.batch}
+    metrics = {f"{name}/{part}": value for part, value in compute_metrics(rounds, progress.sums, counts, buffer).items()}
     return to_strong_type(train_state), rollout.compute_rollout_metrics(counts) | metrics | steps
 
 
-def init_train_state(
-    rounds: Rounds, key: PRNGKeyArray, scenes: Scene, *, policy: Policy, starts: int, rows: dict[str, int] | None = None
-) -> TrainState:
-    """Computes the train state before the first iteration, with an empty buffer.
+def compute_metrics(rounds: Rounds, sums: Metrics, counts: Counts, buffer: Buffer) -> Metrics:
+    """Computes means of the updates' metrics over those that were finite; `skipped`: number of the others; `lost`: part of the samples
+    that was not stored, because the time limit cut it short or a number was not finite; `buffer`: rows that are stored."""
+    changed, skipped, rest = sums["changed"], sums["skipped"], sums.keys() - {"changed", "skipped"}
+    return {
+        **{name: sums[name] / jnp.maximum(changed, 1.0) for name in sorted(rest)},
+        "skipped": skipped,
+        "lost": counts["lost"] / jnp.maximum(counts["lost"] + counts["stored"], 1),
+        "buffer": replay_buffer.count_rows(buffer, axis=rounds.axis).astype(jnp.float32),
+    }
 
-    Args:
-        rows: capacity of several buffers by name; None: there is one, `config.buffer`.
+
+def init_train_state(parts: Sequence[Rounds], key: PRNGKeyArray, scenes: Scene, *, policy: Policy, starts: int) -> TrainState:
+    """Computes the train state before the first iteration of one learner or several, with empty buffers.
 
     Raises:
-        ConfigError: worlds or a batch that the shards do not divide; a buffer that is too small for a round, or larger than the memory.
+        ConfigError: worlds that the shards do not divide; a buffer that is too small for a round, or larger than the memory.
     """
-    train_state = trainer.init_train_state(key, scenes, rounds.env, policy, optax.identity(), starts=starts, ema=False)
-    worlds, config, shards = train_state.worlds, rounds.config, rounds.shards
+    train_state = trainer.init_train_state(key, scenes, parts[0].env, policy, optax.identity(), starts=starts, ema=False)
+    worlds, needed, buffers, learnt = train_state.worlds, 0, {}, {}
     count, agents = worlds.state.active.shape
-    if count % shards:
-        raise ConfigError(f"worlds: expected a multiple of {shards} shards, got {count}")
-    row = describe_row(rounds.learner, worlds)
-    capacities = {"buffer": config.buffer} if rows is None else rows
-    for name, capacity in capacities.items():
-        if capacity < config.unroll * count * agents:
+    for index, rounds in enumerate(parts, start=1):
+        config, shards = rounds.config, rounds.shards
+        if count % shards:
+            raise ConfigError(f"worlds: expected a multiple of {shards} shards, got {count}")
+        if config.buffer < config.unroll * count * agents:
             product = f"unroll {config.unroll} x {count} worlds x {agents} agents"
-            raise ConfigError(f"learner.{name}: expected at least {config.unroll * count * agents}, {product}, got {capacity}")
-    keys = " + ".join(f"learner.{name}" for name in capacities)
-    replay_buffer.check_memory(row, sum(capacities.values()), devices=rounds.devices, key=keys)
-    buffers = {name: replay_buffer.make_empty(row, groups=shards, capacity=capacity // shards) for name, capacity in capacities.items()}
-    learnt = rounds.learner.init(jax.random.fold_in(trainer.split_key(key)[0], 1), train_state.parameters, worlds.observation)
-    train_state = replace(train_state, **learnt._asdict(), buffer=buffers["buffer"] if rows is None else buffers)
-    return trainer.copy_leaves(train_state)
+            raise ConfigError(f"learner.{rounds.key}: expected at least {config.unroll * count * agents}, {product}, got {config.buffer}")
+        row = describe_row(rounds.learner, worlds)
+        needed += replay_buffer.check_memory(row, config.buffer, devices=rounds.devices, taken=needed, key=f"learner.{rounds.key}")
+        buffers[rounds.name] = replay_buffer.make_empty(row, groups=shards, capacity=config.buffer // shards)
+        learner_key = jax.random.fold_in(trainer.split_key(key)[0], index)
+        learnt[rounds.name] = rounds.learner.init(learner_key, train_state.parameters, worlds.observation)
+    learner, optimizer = ({name: getattr(one, field) for name, one in learnt.items()} for field in ("learner", "optimizer"))
+    return trainer.copy_leaves(replace(train_state, learner=learner, optimizer=optimizer, buffer=buffers))
 
 
 def describe_row(learner: Learner, worlds: Worlds) -> Any:
@@ -298,7 +282,7 @@ def read_numbers(config: Mapping[str, Any], schema_of: type[T]) -> T:
     return schema.read({key: value for key, value in config["learner"].items() if key != "_target_"}, schema_of, where="learner")
 
 
-def make_rounds(env: Env, learner: Learner, config: OffPolicyConfig, mesh: Mesh | None) -> Rounds:
+def make_rounds(name: str, env: Env, learner: Learner, config: OffPolicyConfig, mesh: Mesh | None, *, key: str = "buffer") -> Rounds:
     """Joins the constants of all iterations.
 
     Raises:
@@ -310,7 +294,7 @@ def make_rounds(env: Env, learner: Learner, config: OffPolicyConfig, mesh: Mesh 
         raise ConfigError(f"learner.shards: expected a multiple of {devices} devices, got {shards}")
     if config.batch % shards:
         raise ConfigError(f"learner.batch: expected a multiple of {shards} shards, got {config.batch}")
-    return Rounds(env, learner, config, get_axis(mesh), shards, devices)
+    return Rounds(name, env, learner, config, get_axis(mesh), shards, devices, key)
 
 
 def get_axis(mesh: Mesh | None) -> str | None:
@@ -318,23 +302,13 @@ def get_axis(mesh: Mesh | None) -> str | None:
     return None if mesh is None else sharding.AXIS
 
 
-def make_trainer(
-    env: Env,
-    policy: Policy,
-    learner: Learner,
-    config: OffPolicyConfig,
-    *,
-    name: str,
-    episode_steps: int,
-    mesh: Mesh | None,
-) -> Trainer:
-    """Builds the trainer of a single learner.
+def count_starts(env: Env, config: OffPolicyConfig, *, episode_steps: int) -> int:
+    """Counts the actions at which an episode may start, see `trainer.start_worlds`."""
+    return episode_steps // env.action_repeat if config.stagger_episodes else 1
 
-    Args:
-        name: first part of the metrics' names.
-        episode_steps, mesh: as of PPO.
-    """
-    rounds = make_rounds(env, learner, config, mesh)
-    starts = episode_steps // env.action_repeat if config.stagger_episodes else 1
-    init = functools.partial(init_train_state, rounds, policy=policy, starts=starts)
-    return trainer.compile_trainer(init, functools.partial(train_iteration, rounds, name), env, starts=starts, mesh=mesh)
+
+def make_trainer(rounds: Rounds, policy: Policy, *, episode_steps: int, mesh: Mesh | None) -> Trainer:
+    """Builds the trainer of a single learner; `episode_steps` and `mesh` as of PPO."""
+    starts = count_starts(rounds.env, rounds.config, episode_steps=episode_steps)
+    init = functools.partial(init_train_state, [rounds], policy=policy, starts=starts)
+    return trainer.compile_trainer(init, functools.partial(train_iteration, rounds), rounds.env, starts=starts, mesh=mesh)

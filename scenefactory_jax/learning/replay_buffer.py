@@ -112,25 +112,27 @@ def find_finite_rows(rows: Any, valid: Bool[Array, "T W A"]) -> Bool[Array, "T W
     return valid
 
 
-def check_memory(row: Any, rows: int, *, devices: int, key: str) -> None:
-    """Checks that the rows of a device fit into its memory.
+def check_memory(row: Any, rows: int, *, devices: int, taken: int = 0, key: str) -> int:
+    """Checks that the rows of a device fit into its memory; returns how many bytes they take.
 
     Args:
         row: as of `make_empty`.
         rows: of all devices.
+        taken: bytes of other buffers on each device.
         key: of the config, for the message.
 
     Raises:
         ConfigError: naming the size and the number that fits.
     """
     size = sum(int(np.prod(leaf.shape)) * leaf.dtype.itemsize for leaf in jax.tree.leaves(row))
-    free, needed = measure_free_memory(), size * rows // devices
+    free, needed = max(measure_free_memory() - taken, 0), size * rows // devices
     if needed > free:
         fits = free // size * devices
         raise ConfigError(
             f"{key}: {rows:,} transitions of {size / 1e3:.3g} kB take {needed / 1e9:.3g} GB of a device's memory, of which"
             f" {free / 1e9:.3g} GB are free: at most {fits:,} fit; take fewer, or a smaller learner.storage"
         )
+    return needed
 
 
 def measure_free_memory() -> int:

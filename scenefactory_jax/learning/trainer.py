@@ -19,7 +19,7 @@ import jax
 import jax.numpy as jnp
 import optax
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
-from jaxtyping import Array, Float, Int, PRNGKeyArray
+from jaxtyping import Array, Float, Int, Key, PRNGKeyArray
 
 from scenefactory_jax.core import sharding
 from scenefactory_jax.core.pytree import pytree_dataclass, replace, to_strong_type
@@ -97,13 +97,18 @@ def init_train_state(
 
 def start_worlds(env: Env, key: PRNGKeyArray, scenes: Scene, *, starts: int = 1) -> Worlds:
     """Starts an episode in every world, each at one of its first `starts` actions, at random; 1: all at the beginning."""
+    return start_each_world(env, jax.random.split(key, jax.tree.leaves(scenes)[0].shape[0]), scenes, starts=starts)
+
+
+def start_each_world(env: Env, keys: Key[Array, " W"], scenes: Scene, *, starts: int) -> Worlds:
+    """Starts an episode in every world with a key of its own, see `start_worlds`."""
 
     def start(key: PRNGKeyArray, scene: Scene) -> tuple[Any, Observation]:
         step_key, state_key = jax.random.split(key)
         state = env.init_state(state_key, scene, env.action_repeat * jax.random.randint(step_key, (), 0, starts))
         return state, env.observe(scene, state)
 
-    state, observation = jax.vmap(start)(jax.random.split(key, jax.tree.leaves(scenes)[0].shape[0]), scenes)
+    state, observation = jax.vmap(start)(keys, scenes)
     return Worlds(state, observation, make_empty_episode_stats(state))
 
 

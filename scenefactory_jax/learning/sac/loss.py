@@ -1,4 +1,4 @@
-"""The losses of SAC (Haarnoja et al. 2018, arXiv:1812.05905): critics, actor and the weight of the entropy.
+"""The losses of SAC (Haarnoja et al. 2018, arXiv:1812.05905): the critics' target, the actor and the weight of the entropy.
 
 Every mean is over the samples of all devices; a loss is a device's summand of it, and `total` the weight of all samples.
 """
@@ -41,16 +41,6 @@ def compute_target(
         follows: 0 where an event ended the agent, else 1.
     """
     return reward + gamma * follows * (jnp.min(next_values, axis=0) - alpha * next_log_probability)
-
-
-def compute_critic_loss(
-    critics: Any, rows: dict[str, Any], target: Float[Array, "*batch"], weight: Float[Array, "*batch"], *, networks: Networks, total: Array
-) -> tuple[Float[Array, ""], dict[str, Float[Array, ""]]]:
-    """Computes half the mean squared error of both critics."""
-    values = networks.critic.apply(critics, rows["observation"], rows["action"])
-    mean = functools.partial(partial_mean, weight=weight, total=total)
-    loss = mean(0.5 * jnp.mean((values - target) ** 2, axis=0))
-    return loss, jax.lax.stop_gradient({"critic_loss": loss, "value": mean(values[0]), "target": mean(target)})
 
 
 def compute_actor_loss(

@@ -19,6 +19,7 @@ from scenefactory_jax.core import sharding
 from scenefactory_jax.core.types import Env, Observation, Policy, Scene
 from scenefactory_jax.env import environment
 from scenefactory_jax.learning import off_policy, replay_buffer, rollout
+from scenefactory_jax.learning.critics import compute_critic_loss
 from scenefactory_jax.learning.networks import squashed
 from scenefactory_jax.learning.networks.squashed import Networks
 from scenefactory_jax.learning.off_policy import Learner, Learnt
@@ -95,7 +96,7 @@ def update(sac: SAC, learnt: Learnt, rows: dict[str, Any], weight: Float[Array, 
     following = loss.sample_action(networks, learnt.parameters, rows["next_observation"], next_noise)
     values = networks.critic.apply(target, rows["next_observation"], following[0])
     aim = loss.compute_target(rows["reward"], rows["follows"] * 1.0, values, following[1], alpha=alpha, gamma=config.gamma)
-    of_critics = functools.partial(loss.compute_critic_loss, rows=rows, target=aim, weight=weight, networks=networks, total=total)
+    of_critics = functools.partial(compute_critic_loss, rows=rows, target=aim, weight=weight, networks=networks, total=total)
     moved, critic_state, metrics = off_policy.descend(of_critics, critic_adam, critics, states.critics, axis)
 
     constants = {"observation": rows["observation"], "noise": noise, "weight": weight, "total": total}
@@ -124,8 +125,8 @@ def make_learner(policy: Policy, config: SACConfig, axis: str | None) -> Learner
 
 def make_trainer(env: Env, policy: Policy, config: SACConfig, *, episode_steps: int, mesh: Mesh | None = None) -> Trainer:
     """Builds a trainer for one environment and one policy; arguments as of PPO."""
-    learner = make_learner(policy, config, off_policy.get_axis(mesh))
-    return off_policy.make_trainer(env, policy, learner, config, name="sac", episode_steps=episode_steps, mesh=mesh)
+    rounds = off_policy.make_rounds("sac", env, make_learner(policy, config, off_policy.get_axis(mesh)), config, mesh)
+    return off_policy.make_trainer(rounds, policy, episode_steps=episode_steps, mesh=mesh)
 
 
 def make(config: Mapping[str, Any], env: Env, policy: Policy, *, mesh: Mesh | None = None) -> Trainer:
