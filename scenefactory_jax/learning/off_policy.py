@@ -136,6 +136,7 @@ def make_updates(rounds: Rounds, learnt: Learnt, buffer: Buffer, key: PRNGKeyArr
             "skipped": (~changed).astype(jnp.float32),
         }
 
+    @jax.jit  # traced once for both branches
     def run(learnt: Learnt) -> tuple[Learnt, Metrics]:
         learnt, metrics = jax.lax.scan(update, learnt, jax.random.split(key, config.updates))
         return learnt, jax.tree.map(jnp.sum, metrics)

@@ -179,7 +179,7 @@ def _loop(
             seconds = time.monotonic() - before
             spent += seconds / 60
             row = {"iteration": iteration, "minutes": spent, "steps/total": count_spawned_steps(state), **row, "seconds": seconds}
-            row |= {"casps": row["steps/spawned"] / seconds}
+            row["casps"] = row["steps/spawned"] / seconds
             row |= {f"{name}_per_s": row[f"steps/{name}"] / seconds for name in ("updates", "samples") if f"steps/{name}" in row}
             file.add(row)
             log(row)

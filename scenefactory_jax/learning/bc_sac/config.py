@@ -28,6 +28,6 @@ class BCSACConfig(SACConfig):
     def get_imitation(self) -> BCConfig:
         """Returns the numbers of the iterations that imitate."""
         shared: dict[str, Any] = {field.name: getattr(self, field.name) for field in dataclasses.fields(OffPolicyConfig)}
-        own: dict[str, Any] = {"actor": self.actor, "learning_rate": self.imitation_learning_rate, "loss": self.imitation_loss, "expert": self.expert}
-        own["buffer"] = self.expert_buffer
+        own: dict[str, Any] = {"actor": self.actor, "learning_rate": self.imitation_learning_rate, "loss": self.imitation_loss}
+        own |= {"expert": self.expert, "buffer": self.expert_buffer}
         return BCConfig(**shared | own)

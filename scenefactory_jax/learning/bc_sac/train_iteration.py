@@ -32,9 +32,11 @@ def train_iteration(
 ) -> tuple[TrainState, Metrics]:
     """Computes one iteration of the learner whose turn it is; the metrics of the other one are zero, but for its buffer."""
 
+    @jax.jit  # traced once for its shapes and for its branch, as the other one
     def reinforce(train_state: TrainState) -> tuple[TrainState, Metrics]:
         return off_policy.train_iteration(reinforcing, train_state, scenes)
 
+    @jax.jit
     def clone(train_state: TrainState) -> tuple[TrainState, Metrics]:
         before, after, key = jax.random.split(train_state.key, 3)
         train_state = start_anew(cloning, replace(train_state, key=key), scenes, before, starts=starts)

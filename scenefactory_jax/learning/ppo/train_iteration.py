@@ -71,8 +71,6 @@ def train_iteration(ppo: PPO, train_state: TrainState, scenes: Scene) -> tuple[T
         steps=trainer.add_steps(train_state.steps, counts["spawned"]),
     )
     metrics = {f"ppo/{name}": value for name, value in metrics.items()}
-    updates = jnp.float32(config.epochs * config.minibatches)
-    metrics |= {"steps/updates": updates, "steps/samples": updates * size}
     return to_strong_type(train_state), rollout.compute_rollout_metrics(counts) | metrics
 
 
