@@ -18,8 +18,8 @@ from scenefactory_jax.learning.rollout import Act, Worlds
 def make_expert(config: Mapping[str, Any]) -> Act:
     """Builds the expert of a config whose `learner` has the entry `expert`, an option of the group `policy`.
 
-    It drives the cars of the run. What it observes is not what the policy observes: the groups of its own `observations`, in which
-    `action_s` is the run's time between two actions. Its action is one to learn from where the agent is within its log, if it follows one.
+    It drives the cars of the run. It observes the groups of its own `observations`, in which `action_s` is the run's time between two
+    actions, or the run's groups if it has none. Its action is one to learn from where the agent is within its log, if it follows one.
 
     Raises:
         ConfigError: a planner that does not fit.

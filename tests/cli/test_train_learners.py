@@ -1,15 +1,20 @@
 """`train learner=sac` from the config to a run folder whose policy drives, one agent in a world; and the expert of `learner=bc`."""
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
+from support.hand_scenes import scene_of
 from support.running import smoke
+from support.traffic_scenes import track, with_tracks
 
 import scenefactory_jax as sf
+from scenefactory_jax.cli.hydra_config import load_config
 from scenefactory_jax.cli.train import train
 from scenefactory_jax.core.schema import ConfigError
 from scenefactory_jax.data.loading import scene_source
-from scenefactory_jax.env import environment
+from scenefactory_jax.env import environment, traffic
+from scenefactory_jax.env.traffic.mixed import make_absent_boxes
 from scenefactory_jax.learning import expert, rollout, training_loop
 from scenefactory_jax.learning.trainer import get_policy_parameters, start_worlds
 
@@ -41,6 +46,16 @@ def test_its_policy_is_the_actor(run):
     assert np.abs(mean).max() <= 1.0 and not mean[..., 2].any() and np.isneginf(log_std[..., 2]).all()  # the third number is not read
 
 
+def test_its_policy_drives_background_traffic(run):
+    """Trained policies of PPO have one deviation for all observations, these one for each."""
+    entry = load_config("task", "traffic=policy")["traffic"] | {"run": str(run.folder), "sample": True}
+    context = {"physics_dt": 1 / 120, "control_dt": 1 / 30, "friction": lambda weather, position, speed: jnp.ones_like(speed)}
+    kind, scene = traffic.make(entry, **context), with_tracks(scene_of([[0, 40]], [[50, 40]]), track([0.0, 0.0], (5.0, 0.0)))
+    state = jax.eval_shape(kind.init, jax.random.key(0), scene, jnp.int32(0))
+    after = jax.eval_shape(kind.advance, scene, state, make_absent_boxes(1), jnp.int32(0))
+    assert jax.tree.structure(after) == jax.tree.structure(state) and after.drives.shape == (1,)
+
+
 def test_the_expert_of_a_run_follows_the_log(tmp_path):
     """Articulated cars or others, thirty times a second or ten: the expert is told by the run's config."""
     config = smoke(tmp_path / "run", "learner=bc", "spawning=logged", "actions=one_pedal_10hz", *SMALL)
@@ -68,7 +83,7 @@ def test_the_expert_of_a_run_follows_the_log(tmp_path):
     [
         ({"tau": 2.0}, r"learner\.tau: expected a number > 0 and <= 1, got 2"),
         ({"_target_": "scenefactory_jax.learning.bc.train_iteration.make"}, r"learner\.critic_learning_rate: unknown key; valid: .*expert"),
-        ({"_target_": "scenefactory_jax.learning.sac.train_iteration.fit"}, r"learner\._target_: '.*fit' is not in .*; valid: act, init, make, "),
+        ({"_target_": "scenefactory_jax.learning.sac.train_iteration.fit"}, r"learner\._target_: '.*fit' is not in .*; valid: .* make, "),
     ],
 )
 def test_mistakes_are_named(tmp_path, change, message):

@@ -201,6 +201,6 @@ def make_trainer(env: Env, policy: Policy, config: PPOConfig, *, episode_steps: 
 
 def make(config: Mapping[str, Any], env: Env, policy: Policy, *, mesh: Mesh | None = None) -> Trainer:
     """Builds the trainer of a config whose `learner` is PPO; its numbers are the group `ppo`."""
-    schema.check_names(config["learner"], ["_target_", "actor"], where="learner", required=[])
+    schema.check_names(config["learner"], ["_target_"], where="learner", required=[])
     numbers = schema.read(config["ppo"], PPOConfig, where="ppo")
     return make_trainer(env, policy, numbers, episode_steps=environment.episode_steps(config["timing"]), mesh=mesh)
