@@ -32,8 +32,9 @@ def explain_error(error: Exception, config: Mapping[str, Any]) -> str | None:
 
 def _memory(text: str, config: Mapping[str, Any]) -> str:
     place = f"{jax.devices()[0].device_kind}: " if "RESOURCE_EXHAUSTED" in text else ""
-    horizon = (config.get("ppo") or {}).get("horizon")
-    sizes = {"worlds": config.get("worlds"), "ppo.horizon": horizon, "repeats": config.get("repeats")}
+    numbers = {name: config.get(name) or {} for name in ("learner", "ppo")}
+    group = "learner" if "horizon" in numbers["learner"] else "ppo"
+    sizes = {"worlds": config.get("worlds"), f"{group}.horizon": numbers[group].get("horizon"), "repeats": config.get("repeats")}
     held = " ".join(f"{name}={value}" for name, value in sizes.items() if value is not None)
     fewer = "fewer worlds (memory grows in proportion to them)" if "worlds" in config else "fewer scenes at once"
     reason = text.split(". ")[0].rstrip(".")[:160]

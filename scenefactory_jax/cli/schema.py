@@ -107,6 +107,7 @@ class Train(Task):
     loggers: Group
     scenes: Group
     policy: Group
+    learner: Group
     ppo: Group
     stream: Group | None
     evaluation: TrainEvaluation
@@ -173,6 +174,7 @@ class Benchmark(Task):
     loggers: Group
     scenes: Group
     policy: Group
+    learner: Group
     ppo: Group
     stream: Group | None
     baseline: Baseline | None

@@ -17,7 +17,7 @@ from scenefactory_jax.data.formats import reader_selection
 from scenefactory_jax.env import environment
 
 TASK = tuple(group for group in environment.GROUPS if group != "termination")  # the termination is the protocol's
-LEARNER = (*TASK, "termination", "policy", "ppo", "devices")  # groups that the compiled training depends on
+LEARNER = (*TASK, "termination", "policy", "learner", "ppo", "devices")  # groups that the compiled training depends on
 # Keys that do not change what is learnt
 IGNORED = ("name", "out", "resume", "progress", "loggers", "checkpoint_every", "checkpoints_kept", "evaluation")
 TRAINED, UNTRAINED = "checkpoints", "untrained"  # weights: a run's checkpoints, or those before training

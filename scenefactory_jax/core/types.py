@@ -353,8 +353,9 @@ class Env(NamedTuple):
 class Policy(NamedTuple):
     """`apply(parameters, observation) -> (mean [..., 3], log_std [3], value [...])` for any leading axes.
 
-    A logarithm of -inf is that of a policy without noise, as a planner.
+    A deviation may depend on the observation: log_std [..., 3]. A logarithm of -inf is that of a policy without noise, as a planner.
     """
 
     init: Callable[[PRNGKeyArray, Observation], Any]
     apply: Callable[[Any, Observation], tuple[Array, Array, Array]]
+    networks: Any = None  # `learning.networks.squashed.Networks` of the learners that need more than `apply`

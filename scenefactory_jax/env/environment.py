@@ -7,7 +7,7 @@ pure functions for `jit`, `vmap` and `scan`.
 import dataclasses
 import functools
 from collections.abc import Callable, Mapping
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -57,6 +57,7 @@ class Actions:
 
     command: dict[str, Any]  # an entry of `env.actions`
     action_repeat: Count  # control steps per action
+    numbers: Literal[2, 3] = 3  # of an action that `command` reads, from the first on
 
 
 @dataclasses.dataclass(frozen=True)

@@ -36,8 +36,13 @@ class PhaseTimes(NamedTuple):
 
 
 def control_steps(config: Mapping[str, Any]) -> int:
-    """Control steps of a rollout."""
-    return config["ppo"]["horizon"] * config["actions"]["action_repeat"]
+    """Control steps of an iteration."""
+    return get_horizon(config) * config["actions"]["action_repeat"]
+
+
+def get_horizon(config: Mapping[str, Any]) -> int:
+    """Actions of an iteration: the learner's, where it has that number."""
+    return config["learner"].get("horizon", config["ppo"]["horizon"])
 
 
 def make_acting_phase(level: str, parts: EnvParts, env: Env, *, steps: int) -> Run:

@@ -224,13 +224,13 @@ def _check_policy(trained: TrainedPolicy, observation: Observation) -> None:
     try:
         mean, log_std, _ = jax.eval_shape(trained.policy.apply, trained.parameters, observation)
         shapes = f"{mean.shape} and {log_std.shape}"
-        if (mean.shape, log_std.shape) == ((vehicles, 3), (3,)):
+        if mean.shape == (vehicles, 3) and log_std.shape in ((3,), (vehicles, 3)):
             return
     except (TypeError, ValueError, flax.errors.FlaxError) as error:
         shapes = str(error).splitlines()[0]
     raise ConfigError(
         f"traffic.run: {trained.folder}: expected a policy of this version without memory, `apply(parameters, observation)` with means and"
-        f" deviations of shape ({vehicles}, 3) and (3,), got {shapes}"
+        f" deviations of shape ({vehicles}, 3) and (3,) or ({vehicles}, 3), got {shapes}"
     )
 
 

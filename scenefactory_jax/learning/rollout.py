@@ -1,5 +1,6 @@
 """Collects samples: a scan over time of policy, environment and restarts, for all worlds at once."""
 
+from collections.abc import Callable
 from typing import Any
 
 import jax
@@ -53,6 +54,30 @@ class Sample:
     truncated: Bool[Array, "W A"]  # active when the world reached the time limit
 
 
+@pytree_dataclass
+class Outcome:
+    """The results of one action of every slot, until the next action."""
+
+    reward: Float[Array, "W A"]  # sum over the control steps
+    active: Bool[Array, "W A"]  # before the action
+    terminated: Bool[Array, "W A"]  # by an event
+    truncated: Bool[Array, "W A"]  # active when the world reached the time limit
+
+
+@pytree_dataclass
+class Transition:
+    """One action of every slot, with what was observed before and after it."""
+
+    observation: Observation
+    action: Float[Array, "W A 3"]
+    known: Bool[Array, "W A"]  # the action is one to learn from
+    next_observation: Observation  # of another episode, where this one ended
+    outcome: Outcome
+
+
+Act = Callable[[Scene, Worlds, PRNGKeyArray], tuple[Float[Array, "W A 3"], Bool[Array, "W A"]]]
+"""(scenes, worlds, key) -> actions, and a mask of those that are one to learn from."""
+
 Counts = dict[str, Array]
 """Sums over worlds, agents and time, from which metrics are computed."""
 
@@ -71,32 +96,56 @@ def collect_rollout(
 
     def step(worlds: Worlds, key: PRNGKeyArray) -> tuple[Worlds, tuple[Sample, Counts]]:
         action_key, start_key = jax.random.split(key)
-        before = worlds.state
         mean, log_std, value = policy.apply(parameters, worlds.observation)
-        noise = jax.vmap(lambda key: jax.random.normal(key, mean.shape[1:], mean.dtype))(sharding.world_keys(action_key, len(mean), axis))
-        action = mean + jnp.exp(log_std) * noise
-        control = lambda state: jax.vmap(env.control_step)(scenes, state, action)  # noqa: E731
-        after, stats, result, counts = environment.repeat_action(
-            control, before, worlds.episode_stats, action_repeat=env.action_repeat, note=_count_step
-        )
-        sample = Sample(
-            observation=worlds.observation,
-            action=action,
-            mean=mean,
-            log_probability=log_probability(action, mean, log_std),
-            value=value,
-            active=before.active,
-            reward=result.reward,
-            terminated=result.terminated,
-            truncated=environment.find_truncated_agents(result, before.active),
-        )
-        fresh = jax.vmap(env.init_state)(sharding.world_keys(start_key, len(result.world_done), axis), scenes)
-        state = tree_where(result.world_done, fresh, after)
-        return Worlds(state, jax.vmap(env.observe)(scenes, state), stats), (sample, counts)
+        action = mean + jnp.exp(log_std) * sample_noise(action_key, mean, axis)
+        observation = worlds.observation
+        worlds, outcome, counts = step_worlds(env, scenes, worlds, action, start_key, axis=axis)
+        density = log_probability(action, mean, log_std)
+        return worlds, (Sample(observation, action, mean, density, value, **vars(outcome)), counts)
 
     worlds, (samples, counts) = jax.lax.scan(step, worlds, jax.random.split(key, horizon))
-    scene_stats = SceneStats(*(jnp.sum(counts[name], axis=0).astype(jnp.int32) for name in ("ended", "events/goal_reached")))
-    return worlds, samples, jax.tree.map(jnp.sum, counts), scene_stats
+    return worlds, samples, jax.tree.map(jnp.sum, counts), count_episodes(counts)
+
+
+def collect_transitions(
+    env: Env, act: Act, scenes: Scene, worlds: Worlds, key: PRNGKeyArray, *, steps: int, axis: str | None = None
+) -> tuple[Worlds, Transition, Counts, SceneStats]:
+    """Acts `steps` times in `W` worlds, as `collect_rollout`, and returns transitions `[T, W, A]` in place of samples."""
+
+    def step(worlds: Worlds, key: PRNGKeyArray) -> tuple[Worlds, tuple[Transition, Counts]]:
+        action_key, start_key = jax.random.split(key)
+        action, known = act(scenes, worlds, action_key)
+        after, outcome, counts = step_worlds(env, scenes, worlds, action, start_key, axis=axis)
+        return after, (Transition(worlds.observation, action, known, after.observation, outcome), counts)
+
+    worlds, (transitions, counts) = jax.lax.scan(step, worlds, jax.random.split(key, steps))
+    return worlds, transitions, jax.tree.map(jnp.sum, counts), count_episodes(counts)
+
+
+def step_worlds(
+    env: Env, scenes: Scene, worlds: Worlds, action: Float[Array, "W A 3"], key: PRNGKeyArray, *, axis: str | None
+) -> tuple[Worlds, Outcome, Counts]:
+    """Makes one action of all worlds; a world that is done restarts with a new key before it is observed. Counts are of each world."""
+    before = worlds.state
+    control = lambda state: jax.vmap(env.control_step)(scenes, state, action)  # noqa: E731
+    after, stats, result, counts = environment.repeat_action(
+        control, before, worlds.episode_stats, action_repeat=env.action_repeat, note=_count_step
+    )
+    truncated = environment.find_truncated_agents(result, before.active)
+    outcome = Outcome(reward=result.reward, active=before.active, terminated=result.terminated, truncated=truncated)
+    fresh = jax.vmap(env.init_state)(sharding.world_keys(key, len(result.world_done), axis), scenes)
+    state = tree_where(result.world_done, fresh, after)
+    return Worlds(state, jax.vmap(env.observe)(scenes, state), stats), outcome, counts
+
+
+def sample_noise(key: PRNGKeyArray, like: Float[Array, "rows ..."], axis: str | None) -> Float[Array, "rows ..."]:
+    """Samples standard normal numbers; those of a row do not depend on the number of devices."""
+    return jax.vmap(lambda key: jax.random.normal(key, like.shape[1:], like.dtype))(sharding.world_keys(key, len(like), axis))
+
+
+def count_episodes(counts: Counts) -> SceneStats:
+    """Sums counts `[T, W]` over time."""
+    return SceneStats(*(jnp.sum(counts[name], axis=0).astype(jnp.int32) for name in ("ended", "events/goal_reached")))
 
 
 def make_empty_scene_stats(state: State) -> SceneStats:

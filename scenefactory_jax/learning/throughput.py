@@ -69,7 +69,7 @@ def describe_size(config: Mapping[str, Any], shape: tuple[int, ...], mesh: Mesh 
 def _time_training(
     config: Mapping[str, Any], env: Env, worlds: Scene, mesh: Mesh | None, *, warmup: int, repeats: int
 ) -> tuple[PhaseTimes, dict[str, float], Callable[[], PhaseTimes]]:
-    """Times complete iterations of PPO; also the metrics of the last one, and a function that times the rollout alone."""
+    """Times complete iterations of the learner; also the metrics of the last one, and a function that times the rollout alone."""
     policy = make_policy(config)
     trainer = make_trainer(config, env, policy, mesh=mesh)
     state = trainer.init(jax.random.key(config["seed"]), worlds)
@@ -77,7 +77,7 @@ def _time_training(
     state, metrics = total.result
 
     def collect(carry: Any, parameters: Any, scenes: Scene, key: Any) -> Any:
-        return rollout.collect_rollout(env, policy, parameters, scenes, carry, key, horizon=config["ppo"]["horizon"])[:2]
+        return rollout.collect_rollout(env, policy, parameters, scenes, carry, key, horizon=phase_timing.get_horizon(config))[:2]
 
     def time_rollout() -> PhaseTimes:
         arguments = lambda repeat: (state.parameters, worlds, jax.random.key(repeat))  # noqa: E731

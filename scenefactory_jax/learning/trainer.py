@@ -19,7 +19,7 @@ import jax
 import jax.numpy as jnp
 import optax
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
-from jaxtyping import Array, Float, Int, PRNGKeyArray
+from jaxtyping import Array, Float, Int, Key, PRNGKeyArray
 
 from scenefactory_jax.core import sharding
 from scenefactory_jax.core.pytree import pytree_dataclass, replace, to_strong_type
@@ -28,20 +28,23 @@ from scenefactory_jax.learning.rollout import SceneStats, Worlds, make_empty_epi
 
 Metrics = dict[str, Float[Array, ""]]
 MILLION = 1_000_000
+DIVIDED = ("worlds", "buffer")  # fields of the train state
 
 
 @pytree_dataclass
 class TrainState:
     """All that a training carries from one iteration to the next; a run that is resumed from it continues bit for bit."""
 
-    parameters: Any
+    parameters: Any  # of the policy that acts
     ema_parameters: Any  # running mean of the parameters, which is evaluated; None: the config asks for none
-    optimizer: optax.OptState
+    optimizer: Any  # optax's state, or several
     worlds: Worlds
     scene_stats: SceneStats  # of all worlds, on every device
     key: PRNGKeyArray
     iteration: Int[Array, ""]
     steps: Int[Array, " 2"]  # steps of spawned slots so far: millions and the rest, since int32 ends at 2.1 billion
+    learner: Any = ()  # what else the algorithm learns, on every device: critics, target networks
+    buffer: Any = ()  # past samples, with groups of worlds along the first axis, which is divided over the devices
 
 
 class Trainer(NamedTuple):
@@ -89,18 +92,23 @@ def init_train_state(
         iteration=jnp.int32(0),
         steps=jnp.zeros(2, jnp.int32),
     )
-    return _copy(train_state)
+    return copy_leaves(train_state)
 
 
 def start_worlds(env: Env, key: PRNGKeyArray, scenes: Scene, *, starts: int = 1) -> Worlds:
     """Starts an episode in every world, each at one of its first `starts` actions, at random; 1: all at the beginning."""
+    return start_each_world(env, jax.random.split(key, jax.tree.leaves(scenes)[0].shape[0]), scenes, starts=starts)
+
+
+def start_each_world(env: Env, keys: Key[Array, " W"], scenes: Scene, *, starts: int) -> Worlds:
+    """Starts an episode in every world with a key of its own, see `start_worlds`."""
 
     def start(key: PRNGKeyArray, scene: Scene) -> tuple[Any, Observation]:
         step_key, state_key = jax.random.split(key)
         state = env.init_state(state_key, scene, env.action_repeat * jax.random.randint(step_key, (), 0, starts))
         return state, env.observe(scene, state)
 
-    state, observation = jax.vmap(start)(jax.random.split(key, jax.tree.leaves(scenes)[0].shape[0]), scenes)
+    state, observation = jax.vmap(start)(keys, scenes)
     return Worlds(state, observation, make_empty_episode_stats(state))
 
 
@@ -134,7 +142,7 @@ def restart(train_state: TrainState, scenes: Scene, *, env: Env, starts: int) ->
     """Starts new episodes in all worlds; parameters, optimizer and counts of steps stay."""
     start_key, key = jax.random.split(train_state.key)
     worlds = start_worlds(env, start_key, scenes, starts=starts)
-    return _copy(replace(train_state, worlds=worlds, scene_stats=make_empty_scene_stats(worlds.state), key=key))
+    return copy_leaves(replace(train_state, worlds=worlds, scene_stats=make_empty_scene_stats(worlds.state), key=key))
 
 
 def put_scenes(
@@ -196,12 +204,12 @@ def compile_trainer(
 
 
 def _make_specs(train_state: TrainState) -> Any:
-    """Partition specs of a train state: worlds are divided over the devices, all else is replicated."""
+    """Partition specs of a train state: worlds and samples are divided over the devices, all else is replicated."""
     return jax.tree_util.tree_map_with_path(
-        lambda path, _: PartitionSpec(sharding.AXIS) if path[0].name == "worlds" else PartitionSpec(), train_state
+        lambda path, _: PartitionSpec(sharding.AXIS) if path[0].name in DIVIDED else PartitionSpec(), train_state
     )
 
 
-def _copy(tree: Any) -> Any:
+def copy_leaves(tree: Any) -> Any:
     """Copies buffers: `jit` may return an argument (a scene's spawn points) as it is, and donating it would delete the scene."""
     return jax.tree.map(jnp.copy, to_strong_type(tree))

@@ -13,15 +13,14 @@ from jax.sharding import Mesh
 
 from scenefactory_jax import loggers
 from scenefactory_jax.core import config as configs
-from scenefactory_jax.core import schema, sharding
-from scenefactory_jax.core.instantiate import ConfigError, instantiate
+from scenefactory_jax.core import sharding
+from scenefactory_jax.core.instantiate import ConfigError, instantiate, resolve_target
 from scenefactory_jax.core.types import Env, Policy, Scene
 from scenefactory_jax.data.loading import scene_source, stream
 from scenefactory_jax.env import environment
 from scenefactory_jax.learning import checkpoint, interrupt, run_folder
 from scenefactory_jax.learning.networks import late_fusion
-from scenefactory_jax.learning.ppo.config import PPOConfig
-from scenefactory_jax.learning.ppo.train_iteration import make_trainer as make_ppo_trainer
+from scenefactory_jax.learning.ppo import train_iteration as ppo
 from scenefactory_jax.learning.trainer import Trainer, TrainState, count_spawned_steps, get_policy_parameters
 from scenefactory_jax.loggers import metrics_csv
 
@@ -125,16 +124,25 @@ def _open_scenes(
 
 
 def make_policy(config: Mapping[str, Any]) -> Policy:
-    """Builds the policy of a config's `policy` entry; planners are given the run's `dynamics`, encoders its `observations`."""
+    """Builds the policy of a config's `policy` entry.
+
+    Planners are given the run's `dynamics`, encoders its `observations`, and networks the kind of actor that its `learner` trains and how
+    many numbers of an action its `actions` read.
+    """
     names = {"dynamics": "dynamics", "observations": "observation_groups"}  # planners have numbers that are called observations
     context = {names[key]: config[key] for key in names if key in config}
+    learner, actions = config.get("learner", {}), config.get("actions", {})
+    context |= {name: part[name] for name, part in (("actor", learner), ("numbers", actions)) if name in part}
     return instantiate(config["policy"], builtins=late_fusion, where="policy", **context)()
 
 
 def make_trainer(config: Mapping[str, Any], env: Env, policy: Policy, *, mesh: Mesh | None = None) -> Trainer:
-    """Builds PPO for a config, on one device or on a mesh (`sharding.make_mesh`)."""
-    numbers = schema.read(config["ppo"], PPOConfig, where="ppo")
-    return make_ppo_trainer(env, policy, numbers, episode_steps=environment.episode_steps(config["timing"]), mesh=mesh)
+    """Builds the learner of a config, on one device or on a mesh (`sharding.make_mesh`).
+
+    The entry `learner` names a function (config, env, policy, mesh=) -> Trainer, and has the numbers that it reads.
+    """
+    make = resolve_target(config["learner"]["_target_"], builtins=ppo, where="learner")
+    return make(config, env, policy, mesh=mesh)
 
 
 def _loop(
@@ -172,6 +180,7 @@ def _loop(
             spent += seconds / 60
             row = {"iteration": iteration, "minutes": spent, "steps/total": count_spawned_steps(state), **row, "seconds": seconds}
             row["casps"] = row["steps/spawned"] / seconds
+            row |= {f"{name}_per_s": row[f"steps/{name}"] / seconds for name in ("updates", "samples") if f"steps/{name}" in row}
             file.add(row)
             log(row)
             show(iteration, describe(row))
@@ -190,7 +199,7 @@ def _loop(
 
 
 def check_finite(row: Mapping[str, float | int]) -> None:
-    """Checks that the iteration could learn: a reward term that is not finite may have made every minibatch unusable.
+    """Checks that the iteration could learn: a reward term that is not finite may have made every sample unusable.
 
     A car whose state is not finite ends as `numerical_error`; then single minibatches are left out (`ppo/skipped`), which is no error.
 
@@ -198,12 +207,18 @@ def check_finite(row: Mapping[str, float | int]) -> None:
         ConfigError: naming the terms.
     """
     terms = [name for name, value in row.items() if name.startswith("reward/") and not math.isfinite(value)]
-    if terms and row.get("ppo/skipped", 0) > 0 and row.get("ppo/gradient_norm") == 0.0:
+    if terms and any(row[f"{name}/gradient_norm"] == 0.0 for name in _find_unusable(row)):
         values = ", ".join(f"{name.replace('/', '.')}: {row[name]}" for name in terms)
         raise ConfigError(
             f"{values} in iteration {row['iteration']}, so no minibatch could be learnt from;"
             " look for a division by zero, or a log or root below zero, or leave it out: ~" + terms[0].replace("/", ".")
         )
+
+
+def _find_unusable(row: Mapping[str, float | int]) -> list[str]:
+    """Finds the learners that skipped minibatches, or whose buffer is still empty."""
+    learners = [name.removesuffix("/gradient_norm") for name in row if name.endswith("/gradient_norm")]
+    return [name for name in learners if row.get(f"{name}/skipped", 0) > 0 or row.get(f"{name}/buffer") == 0.0]
 
 
 def step(

@@ -19,10 +19,10 @@ from scenefactory_jax.core.instantiate import ConfigError
 PLAIN = "--xla_backend_optimization_level=0 --xla_llvm_disable_expensive_passes=true"
 
 
-def start(pairs, *more, visible=4):
+def start(pairs, *more, visible=4, module="support.sharding"):
     flags = f"{os.environ['XLA_FLAGS']} {PLAIN} --xla_force_host_platform_device_count={visible}"
     environment = {**os.environ, "XLA_FLAGS": flags, "JAX_PLATFORMS": "cpu", "PYTHONPATH": f"{ROOT}{os.pathsep}{ROOT / 'tests'}"}
-    arguments = [sys.executable, "-m", "support.sharding", pairs, *more]
+    arguments = [sys.executable, "-m", module, pairs, *more]
     return subprocess.Popen(arguments, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=environment)
 
 
@@ -72,6 +72,18 @@ def test_four_devices_and_two_processes_learn_the_same(found):
     for [one] in map(result, both):
         assert (one["devices"], one["processes"]) == (2, 2)
         agree(one, found[1, 4])
+
+
+def test_learners_off_policy_learn_the_same_on_two_devices():
+    """Each device has its worlds' part of the buffer; gradients are sums, so that all hold the same networks."""
+    one, both = result(start("bc_sac", visible=2, module="support.learner_sharding"))
+    assert both["same"] and both["parts"] == [2, 2] and one["parts"] == [1, 1]
+    assert one["filled"] == both["filled"] and all(map(all, one["filled"]))
+    for name in ("parameters", "critics"):
+        np.testing.assert_allclose(one[name], both[name], atol=2e-4)
+    for mine, theirs in zip(one["rows"], both["rows"], strict=True):
+        np.testing.assert_allclose(mine, theirs, atol=2e-4)
+    assert one["metrics"] == pytest.approx(both["metrics"], rel=1e-3, abs=1e-3)
 
 
 def test_mistakes_are_named():

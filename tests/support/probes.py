@@ -4,6 +4,7 @@ Each is an `Env` of one world whose body is one number an agent, the cue. The la
 """
 
 import dataclasses
+import importlib
 import types
 
 import jax
@@ -60,6 +61,33 @@ SMALL = dict(
     kernels=True,
 )
 
+REPLAY = dict(
+    horizon=8,
+    unroll=2,
+    updates_per_step=4.0,
+    batch=64,
+    buffer=512,
+    storage="float32",
+    learning_starts=32,
+    shards=None,
+    max_grad_norm=10.0,
+    stagger_episodes=False,
+)
+CRITICS = dict(learning_rate=1e-2, critic_learning_rate=1e-2, gamma=0.9, tau=0.05)
+SOFT = dict(actor="tanh_gaussian", alpha=0.01, entropy_target=None, alpha_learning_rate=1e-2)
+LEARNERS = {
+    "sac": REPLAY | CRITICS | SOFT,
+    "td3": REPLAY
+    | CRITICS
+    | dict(actor="deterministic", learning_rate=3e-3, exploration_std=0.3, target_noise_std=0.1, target_noise_clip=0.2, policy_delay=2),
+    "bc": REPLAY | dict(actor="tanh_gaussian", learning_rate=1e-2, loss="squared_error", expert={}),
+    "bc_sac": REPLAY
+    | CRITICS
+    | SOFT
+    | dict(imitation_every=2, imitation_learning_rate=1e-2, imitation_loss="squared_error", expert={}, expert_buffer=256),
+}
+STEERS = 0.3  # action of the probes' expert that no reward asks for
+
 
 def blank(cls, **known):
     """A struct of zeros wherever a probe has nothing to say."""
@@ -83,6 +111,23 @@ def ppo_config(**changes) -> PPOConfig:
 def make_trainer(env: Env, *, episode_steps: int = 1000, mesh=None, **changes) -> Trainer:
     """PPO with those numbers and the small network."""
     return train_iteration.make_trainer(env, late_fusion.make(**SMALL), ppo_config(**changes), episode_steps=episode_steps, mesh=mesh)
+
+
+def make_learner(name: str, env: Env, *, mesh=None, episode_steps: int = 1000, actions: int = 2, **changes):
+    """A learner off policy with the numbers above and the small network: its policy and its trainer."""
+    module, config = (importlib.import_module(f"scenefactory_jax.learning.{name}.{part}") for part in ("train_iteration", "config"))
+    [kind] = (value for key, value in vars(config).items() if key.lower() == f"{name.replace('_', '')}config")
+    numbers = schema.read({**LEARNERS[name], **changes}, kind, where="learner")
+    policy = late_fusion.make(**SMALL, actor=numbers.actor, numbers=actions)
+    experts = [expert] if name.startswith("bc") else []
+    return policy, module.make_trainer(env, policy, numbers, *experts, episode_steps=episode_steps, mesh=mesh)
+
+
+def expert(scenes, worlds, key):
+    """Presses the throttle as task 5 wants it, and steers. What it does with a cue of -1 in the second slot is not known."""
+    cue = worlds.state.body
+    known = (cue > 0) | (jnp.arange(AGENTS) != 1)
+    return jnp.stack([jnp.where(known, 0.5 * cue, 0.9), jnp.full_like(cue, STEERS), jnp.zeros_like(cue)], axis=-1), known
 
 
 def scenes(worlds: int, task: int = 5) -> Scene:

@@ -1,4 +1,4 @@
-"""Policy of PPO on any encoder: heads of an actor and a critic, and a state-independent log standard deviation."""
+"""Policy on any encoder: heads of an actor and a critic, and of PPO a state-independent log standard deviation."""
 
 from typing import Any, Literal
 
@@ -8,6 +8,7 @@ from jaxtyping import Array, Float
 
 from scenefactory_jax.core.schema import ConfigError, Count
 from scenefactory_jax.core.types import Observation, Policy
+from scenefactory_jax.learning.networks import squashed
 from scenefactory_jax.learning.networks.heads import Encoder, Head, lecun_uniform, make_encoder
 
 
@@ -22,8 +23,10 @@ def make(
     actor_head_scale: float,
     dtype: Literal["float32", "bfloat16"],
     observation_groups: dict[str, Any],
+    actor: squashed.Actor = "gaussian",
+    numbers: int = squashed.FULL,
 ) -> Policy:
-    """Builds the policy.
+    """Builds the policy of PPO, or a squashed actor and critics.
 
     Args:
         encoder: entry of `encoders`.
@@ -32,6 +35,7 @@ def make(
         mean_init, log_std_init, actor_head_scale: as of `late_fusion.make`.
         dtype: of products; the first layers of encoders, the last ones of heads, sums, parameters, means and values are float32.
         observation_groups: the config's `observations`.
+        actor, numbers: of the learner, and of an action; supplied. A squashed actor and its critics share no encoder.
 
     Raises:
         ConfigError: a number that does not fit; at `init`, an observation that the encoder cannot read.
@@ -39,8 +43,11 @@ def make(
     if len(mean_init) != 3:
         raise ConfigError(f"policy.mean_init: expected 3 numbers, throttle, steer and brake, got {mean_init}")
     bound = make_encoder(encoder, observations=observation_groups, dtype=dtype)
-    numbers = tuple(map(float, mean_init)), float(log_std_init), float(actor_head_scale)
-    network = ActorCritic(bound, tuple(hidden), activation, shared_encoder, *numbers, dtype)
+    first = {"mean_init": tuple(map(float, mean_init)), "log_std_init": float(log_std_init), "actor_head_scale": float(actor_head_scale)}
+    if actor != "gaussian":
+        head = {"hidden": hidden, "activation": activation, "dtype": dtype, "activate_last": False}
+        return squashed.make(bound, actor=actor, numbers=numbers, **head, **first)
+    network = ActorCritic(bound, tuple(hidden), activation, shared_encoder, **first, dtype=dtype)
     return Policy(network.init, network.apply)  # pyright: ignore[reportArgumentType]
 
 

@@ -54,12 +54,14 @@ def make_encoder(entry: Mapping[str, Any], *, observations: Mapping[str, Any], d
     return instantiate(entry, builtins=builtins, where=where, read=make_reader(observations), dtype=dtype)()
 
 
-def make_actor(encoder: Encoder, outputs: int, *, hidden: Sequence[Count], activation: str, dtype: str = "float32") -> Network:
+def make_actor(
+    encoder: Encoder, outputs: int, *, hidden: Sequence[Count], activation: str, dtype: str = "float32", activate_last: bool = False
+) -> Network:
     """Builds `apply(parameters, observation) -> [..., outputs]`: parameters of a distribution, or of a deterministic action.
 
     Args:
         encoder: makes a new encoder, see `Encoder`.
-        hidden, activation: of the head, see `Head`.
+        hidden, activation, activate_last: of the head, see `Head`.
         dtype: of the head's products.
 
     Raises:
@@ -67,7 +69,7 @@ def make_actor(encoder: Encoder, outputs: int, *, hidden: Sequence[Count], activ
     """
     if activation not in ACTIVATIONS:
         raise ConfigError(f"policy.activation: expected one of {', '.join(ACTIVATIONS)}, got {activation!r}")
-    tower = Tower(encoder, functools.partial(Head, tuple(hidden), outputs, activation, dtype))
+    tower = Tower(encoder, functools.partial(Head, tuple(hidden), outputs, activation, dtype, activate_last=activate_last))
     return Network(tower.init, tower.apply)
 
 
@@ -77,12 +79,14 @@ def make_value(encoder: Encoder, *, hidden: Sequence[Count], activation: str, dt
     return Network(value.init, lambda parameters, observation: value.apply(parameters, observation)[..., 0])
 
 
-def make_critic(encoder: Encoder, count: int = 2, *, hidden: Sequence[Count], activation: str, dtype: str = "float32") -> Network:
+def make_critic(
+    encoder: Encoder, count: int = 2, *, hidden: Sequence[Count], activation: str, dtype: str = "float32", activate_last: bool = False
+) -> Network:
     """Builds `apply(parameters, observation, action) -> [count, ...]`: values of that many networks without shared weights.
 
     Each has an encoder and a head of its own; the head reads the feature joined with the action. Parameters have the axis `count` in front.
     """
-    one = make_actor(encoder, 1, hidden=hidden, activation=activation, dtype=dtype)
+    one = make_actor(encoder, 1, hidden=hidden, activation=activation, dtype=dtype, activate_last=activate_last)
 
     def init(key: PRNGKeyArray, observation: Observation, action: Float[Array, "*batch D"]) -> Any:
         return jax.vmap(lambda key: one.init(key, observation, action))(jax.random.split(key, count))
@@ -100,7 +104,8 @@ def split_gaussian(raw: Float[Array, "*batch twice"]) -> tuple[Float[Array, "*ba
 
 
 class Head(nn.Module):
-    """Dense layers with activations between them and none after the last of `hidden`, then a linear layer to the outputs.
+    """Dense layers with activations between them, then a linear layer to the outputs; after the last of `hidden` there is an activation
+    only with `activate_last`.
 
     Hidden layers multiply in `dtype`, the last one in float32.
     """
@@ -111,12 +116,14 @@ class Head(nn.Module):
     dtype: str
     kernel_init: Callable = lecun_uniform  # of the last layer
     bias_init: Callable = nn.initializers.zeros
+    activate_last: bool = False
 
     @nn.compact
     def __call__(self, x: Float[Array, "*batch F"]) -> Float[Array, "*batch outputs"]:
         for index, width in enumerate(self.hidden):
             x = ACTIVATIONS[self.activation](x) if index else x
             x = nn.Dense(width, kernel_init=lecun_uniform, dtype=self.dtype, name=f"layer_{index}")(x)
+        x = ACTIVATIONS[self.activation](x) if self.activate_last else x
         last = nn.Dense(self.outputs, kernel_init=self.kernel_init, bias_init=self.bias_init, dtype=jnp.float32, name="last")
         return last(x)
 

@@ -25,7 +25,7 @@ from jaxtyping import Array, Bool, Float, PRNGKeyArray
 from scenefactory_jax.core.pallas import on_gpu
 from scenefactory_jax.core.schema import ConfigError, Count
 from scenefactory_jax.core.types import Observation, Policy, SetObservation
-from scenefactory_jax.learning.networks import set_kernel
+from scenefactory_jax.learning.networks import set_kernel, squashed
 from scenefactory_jax.learning.networks.heads import ACTIVATIONS
 from scenefactory_jax.learning.networks.observation_blocks import check_groups
 
@@ -55,8 +55,10 @@ def make(
     actor_head_scale: float,
     dtype: Literal["float32", "bfloat16"],
     kernels: bool,
+    actor: squashed.Actor = "gaussian",
+    numbers: int = squashed.FULL,
 ) -> Policy:
-    """Builds two late-fusion towers and a state-independent log standard deviation.
+    """Builds two late-fusion towers and a state-independent log standard deviation, or a squashed actor and critics.
 
     Args:
         vector: widths of the encoder of all vector groups.
@@ -70,6 +72,8 @@ def make(
             (Andrychowicz et al. 2021, "What matters in on-policy reinforcement learning?"). The published code has PyTorch's default.
         dtype: of products behind the first layer of an encoder; features, sums, parameters, means and values stay float32.
         kernels: Triton kernels for sets where there is an NVIDIA GPU; False: plain JAX.
+        actor, numbers: of the learner, and of an action; supplied. A squashed actor: `squashed.make` on the encoders, with the trunk as
+            head, whose means and deviations before the tanh begin as above.
 
     Raises:
         ConfigError: at `init`, an observation without groups or with one for planners, or widths for a set that it does not have.
@@ -82,16 +86,22 @@ def make(
     if len(mean_init) != 3:
         raise ConfigError(f"policy.mean_init: expected 3 numbers, throttle, steer and brake, got {mean_init}")
     architecture = Architecture(tuple(vector), tuple(named.items()), tuple(rows_default), tuple(trunk), activation, dtype, kernels)
-    network = ActorCritic(architecture, tuple(map(float, mean_init)), float(log_std_init), float(actor_head_scale))
+    first = {"mean_init": tuple(map(float, mean_init)), "log_std_init": float(log_std_init), "actor_head_scale": float(actor_head_scale)}
+    if actor == "gaussian":
+        network = ActorCritic(architecture, **first)
+        policy = Policy(network.init, network.apply)  # pyright: ignore[reportArgumentType]
+    else:
+        head = {"hidden": trunk, "activation": activation, "dtype": dtype, "activate_last": True}
+        policy = squashed.make(functools.partial(Fusion, architecture), actor=actor, numbers=numbers, **head, **first)
 
     def init(key: PRNGKeyArray, observation: Observation) -> Any:
         check_groups(observation)
         groups = sorted(name for name, group in observation.items() if isinstance(group, SetObservation))
         if unknown := sorted(set(named) - set(groups)):
             raise ConfigError(f"policy.rows.{unknown[0]}: the observation has no such set; valid: {', '.join(groups) or 'none'}")
-        return network.init(key, observation)
+        return policy.init(key, observation)
 
-    return Policy(init, network.apply)  # pyright: ignore[reportArgumentType]
+    return policy._replace(init=init)
 
 
 class ActorCritic(nn.Module):
@@ -124,6 +134,16 @@ class Tower(nn.Module):
         x = activate(Layers(architecture, architecture.trunk, name="trunk")(fused.astype(architecture.dtype)))
         kernel, bias = nn.initializers.orthogonal(self.head_scale), lambda *_: jnp.array(self.head_bias, jnp.float32)
         return nn.Dense(len(self.head_bias), kernel_init=kernel, bias_init=bias, dtype=jnp.float32, name="head")(x)
+
+
+class Fusion(nn.Module):
+    """Encoders and fusion."""
+
+    architecture: Architecture
+
+    @nn.compact
+    def __call__(self, observation: Observation) -> Float[Array, "*batch W"]:
+        return fuse(self.architecture, observation)
 
 
 def fuse(architecture: Architecture, observation: Observation) -> Float[Array, "*batch W"]:

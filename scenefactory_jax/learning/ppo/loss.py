@@ -14,6 +14,7 @@ from scenefactory_jax.core import sharding
 from scenefactory_jax.core.pytree import pytree_dataclass
 from scenefactory_jax.core.types import Observation, Policy
 from scenefactory_jax.learning import gaussian
+from scenefactory_jax.learning.means import partial_mean, weighted_mean
 from scenefactory_jax.learning.ppo.config import PPOConfig
 
 
@@ -66,16 +67,6 @@ def compute_loss(
         "clip_fraction": average((jnp.abs(ratio - 1.0) > clip_eps).astype(jnp.float32)),
     }
     return total, jax.lax.stop_gradient(metrics)
-
-
-def partial_mean(x: Float[Array, "*batch"], *, weight: Float[Array, "*batch"], total: Float[Array, ""]) -> Float[Array, ""]:
-    """Computes the summand of these samples in a weighted mean over the weight `total`; values without weight may be anything, even NaN."""
-    return jnp.sum(jnp.where(weight > 0.0, x * weight, 0.0)) / jnp.maximum(total, 1e-8)
-
-
-def weighted_mean(x: Float[Array, "*batch"], weight: Float[Array, "*batch"], *, axis: str | None = None) -> Float[Array, ""]:
-    """Computes the weighted mean over all devices; zero if there is no weight."""
-    return sharding.sum_over_devices(partial_mean(x, weight=weight, total=sharding.sum_over_devices(jnp.sum(weight), axis)), axis)
 
 
 def normalize_advantages(x: Float[Array, "*batch"], weight: Float[Array, "*batch"], *, axis: str | None = None) -> Float[Array, "*batch"]:

@@ -7,6 +7,7 @@ own worlds and samples; sums over samples, and with them gradients, are sums ove
 
 import dataclasses
 import functools
+from collections.abc import Mapping
 from typing import Any
 
 import jax
@@ -15,10 +16,11 @@ import optax
 from jax.sharding import Mesh
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
-from scenefactory_jax.core import sharding
+from scenefactory_jax.core import schema, sharding
 from scenefactory_jax.core.pytree import replace, to_strong_type
 from scenefactory_jax.core.schema import ConfigError
 from scenefactory_jax.core.types import Env, Policy, Scene
+from scenefactory_jax.env import environment
 from scenefactory_jax.learning import rollout, trainer
 from scenefactory_jax.learning.ppo import gae, loss
 from scenefactory_jax.learning.ppo.config import PPOConfig
@@ -57,7 +59,8 @@ def train_iteration(ppo: PPO, train_state: TrainState, scenes: Scene) -> tuple[T
 
     metrics["explained_variance"] = loss.explained_variance(batch.value, batch.returns, batch.weight, axis=axis)
     counts = sharding.sum_over_devices(counts, axis)
-    train_state = TrainState(
+    train_state = replace(
+        train_state,
         parameters=parameters,
         ema_parameters=trainer.advance_ema(train_state, parameters, config.parameter_ema_decay),
         optimizer=optimizer,
@@ -194,3 +197,10 @@ def make_trainer(env: Env, policy: Policy, config: PPOConfig, *, episode_steps: 
         return train_state
 
     return trainer.compile_trainer(init, functools.partial(train_iteration, ppo), env, starts=starts, mesh=mesh)
+
+
+def make(config: Mapping[str, Any], env: Env, policy: Policy, *, mesh: Mesh | None = None) -> Trainer:
+    """Builds the trainer of a config whose `learner` is PPO; its numbers are the group `ppo`."""
+    schema.check_names(config["learner"], ["_target_"], where="learner", required=[])
+    numbers = schema.read(config["ppo"], PPOConfig, where="ppo")
+    return make_trainer(env, policy, numbers, episode_steps=environment.episode_steps(config["timing"]), mesh=mesh)

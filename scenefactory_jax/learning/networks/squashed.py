@@ -1,0 +1,107 @@
+"""Policies whose actions pass through tanh, for learners off policy: squashed Gaussians (SAC), deterministic ones (TD3), and critics.
+
+`Policy.apply` gives the deterministic action, tanh(mean), as what is evaluated. An action has 3 numbers, or the first 2 of them where the
+environment reads no more (`actions.numbers`); the third is then 0.
+"""
+
+import functools
+import math
+from collections.abc import Callable, Sequence
+from typing import Any, Literal, NamedTuple
+
+import flax.linen as nn
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, PRNGKeyArray
+
+from scenefactory_jax.core.schema import ConfigError
+from scenefactory_jax.core.types import Observation, Policy
+from scenefactory_jax.learning.networks.heads import MIN_STD, Encoder, Head, Network, Tower, make_critic, split_gaussian
+
+Actor = Literal["gaussian", "tanh_gaussian", "deterministic"]
+"""gaussian: of PPO, not squashed."""
+
+FULL = 3  # numbers of an action of the environment
+
+
+class Networks(NamedTuple):
+    """The parts of a policy that a learner needs; D: numbers of an action."""
+
+    actor: Actor
+    numbers: int
+    distribution: Callable[[Any, Observation], tuple[Array, Array]]  # (parameters, observation) -> mean, std [..., D] before the tanh
+    critic: Network  # (parameters, observation, action [..., D]) -> values [2, ...]
+
+
+def make(
+    encoder: Encoder,
+    *,
+    actor: Actor,
+    numbers: int,
+    hidden: Sequence[int],
+    activation: str,
+    dtype: str,
+    activate_last: bool,
+    mean_init: Sequence[float],
+    log_std_init: float,
+    actor_head_scale: float,
+) -> Policy:
+    """Builds the policy and two critics, each with an encoder of its own.
+
+    Args:
+        numbers: of an action, 2 or 3.
+        hidden, activation, dtype, activate_last: of each head, see `heads.Head`.
+        mean_init: first means before the tanh.
+        log_std_init: logarithm of the first standard deviations before the tanh; read for the actor `tanh_gaussian` alone.
+        actor_head_scale: gain of the orthogonal kernel of the actor's last layer.
+
+    Raises:
+        ConfigError: a first standard deviation that is not above the smallest one.
+    """
+    is_random = actor == "tanh_gaussian"
+    bias = [*mean_init[:numbers]]
+    if is_random:
+        spread = math.exp(log_std_init) - MIN_STD
+        if spread <= 0.0:
+            raise ConfigError(f"policy.log_std_init: expected a number above the logarithm of {MIN_STD}, got {log_std_init}")
+        bias += [math.log(math.expm1(spread))] * numbers
+    last = nn.initializers.orthogonal(actor_head_scale), lambda *_: jnp.array(bias, jnp.float32)
+    tower = Tower(encoder, functools.partial(Head, tuple(hidden), len(bias), activation, dtype, *last, activate_last))
+
+    def distribution(parameters: Any, observation: Observation) -> tuple[Array, Array]:
+        raw: Any = tower.apply(parameters, observation)
+        return split_gaussian(raw) if is_random else (raw, jnp.zeros_like(raw))
+
+    def apply(parameters: Any, observation: Observation) -> tuple[Array, Array, Array]:
+        mean, std = distribution(parameters, observation)
+        action = jnp.tanh(mean)
+        log_std = jnp.log(std * (1.0 - action**2))  # of the squashed action, to first order; -inf without noise
+        return pad_action(action), pad_action(log_std, fill=-jnp.inf), jnp.zeros_like(action[..., 0])
+
+    critic = make_critic(encoder, 2, hidden=hidden, activation=activation, dtype=dtype, activate_last=activate_last)
+    return Policy(tower.init, apply, Networks(actor, numbers, distribution, critic))  # pyright: ignore[reportArgumentType]
+
+
+def pad_action(action: Float[Array, "*batch D"], fill: float = 0.0) -> Float[Array, "*batch 3"]:
+    """Appends the numbers that the environment does not read."""
+    return jnp.pad(action, [(0, 0)] * (action.ndim - 1) + [(0, FULL - action.shape[-1])], constant_values=fill)
+
+
+def get_networks(policy: Policy, actors: Sequence[Actor], *, learner: str) -> Networks:
+    """Returns the networks of a policy that a learner can train.
+
+    Raises:
+        ConfigError: a policy without them, or with another kind of actor.
+    """
+    networks = policy.networks
+    if networks is None:
+        raise ConfigError(f"policy: learner {learner} needs one with critics; valid: policy=late_fusion, policy=actor_critic")
+    if networks.actor not in actors:
+        raise ConfigError(f"learner.actor: expected {' or '.join(actors)}, got {networks.actor}")
+    return networks
+
+
+def init_critics(policy: Policy, key: PRNGKeyArray, observation: Observation) -> Any:
+    """Samples the critics' parameters; of the observation only shapes matter."""
+    action = jnp.zeros((*jax.tree.leaves(observation)[0].shape[:2], policy.networks.numbers), jnp.float32)
+    return policy.networks.critic.init(key, jax.tree.map(lambda leaf: leaf[:1], observation), action[:1])
