@@ -34,7 +34,7 @@ def numbers_of(name, **changes):
 
 
 def made(name, *, control_dt=CONTROL, **changes):
-    timing = {"control_dt": control_dt} if name == "log_playback" else {}
+    timing = {"control_dt": control_dt} if name in ("log_playback", "constant") else {}
     function = getattr(traffic, load_config("task", f"traffic={name}")["traffic"]["_target_"])
     return function(**numbers_of(name, **changes), **timing)
 
