@@ -4,12 +4,12 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray
 
+EDGE = 1e-3  # distance of a squashed action from -1 and 1, nearer to which its density is that at this distance: it has no bound there
 
-def sample(key: PRNGKeyArray, mean: Float[Array, "*batch D"], log_std: Float[Array, " D"]) -> Float[Array, "*batch D"]:
+
+def sample(key: PRNGKeyArray, mean: Float[Array, "*batch D"], log_std: Float[Array, "*#batch D"]) -> Float[Array, "*batch D"]:
     """Samples actions; where a deviation is 0 (its logarithm -inf), the mean."""
     return mean + jnp.exp(log_std) * jax.random.normal(key, mean.shape, mean.dtype)
-
-EDGE = 1e-3  # distance of a squashed action from -1 and 1, nearer to which its density is that at this distance: it has no bound there
 
 
 def log_probability(

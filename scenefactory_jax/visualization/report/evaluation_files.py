@@ -58,11 +58,7 @@ def write(
             begin_folder(out, {**request, "episodes": episodes, **{key: settings[key] for key in ("seed", "repeats", "untrained")}})
         records[label] = evaluation.records
         _write_agents(out, evaluation, protocol=request["protocol"], versions=versions)
-        if recording is not None and recording.failures is not None and (shown := settings["replay_worlds"]):
-            page = out / f"replay-{label.replace(', ', '-')}.html"
-            pages[f"Episodes, {label}"] = episode_page.write(page, recording, evaluation.records, worlds=shown)
-        if evaluation.rollouts and settings["protocol"]["scores"]["wosac"]["submission"]:
-            wosac_submission.write_all(out / f"rollouts-{label.replace(', ', '-')}", evaluation.rollouts)
+        pages |= _write_episodes(out, evaluation, settings)
         if recording is None or evaluation.policy != "trained":
             continue
         if settings["video"]["enable"] and not trajectories:
@@ -102,6 +98,17 @@ def _write_agents(out: Path, evaluation: Evaluated, *, protocol: str, versions: 
     metadata = {"protocol": protocol, "termination": evaluation.protocol, "policy": evaluation.policy}
     metadata |= {"config_digest": evaluation.digest, "versions": versions}
     write_records(out / name_file(evaluation.label), evaluation.records, metadata=metadata)
+
+
+def _write_episodes(out: Path, evaluation: Evaluated, settings: Mapping[str, Any]) -> dict[str, Path]:
+    """Writes the page of scored worlds and the files of a submission, and returns the page by its title."""
+    recording, name = evaluation.recording, evaluation.label.replace(", ", "-")
+    if evaluation.rollouts and settings["protocol"]["scores"]["wosac"]["submission"]:
+        wosac_submission.write_all(out / f"rollouts-{name}", evaluation.rollouts)
+    if recording is None or recording.failures is None or not (shown := settings["replay_worlds"]):
+        return {}
+    page = episode_page.write(out / f"replay-{name}.html", recording, evaluation.records, worlds=shown)
+    return {f"Episodes, {evaluation.label}": page}
 
 
 def _describe_episodes(config: Mapping[str, Any], settings: Mapping[str, Any]) -> dict[str, str]:

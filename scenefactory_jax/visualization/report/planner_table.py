@@ -20,6 +20,7 @@ from scenefactory_jax.visualization.report.tables import Summary
 
 Content = TypeVar("Content")
 SCORED = ("accuracy", "overlap", "off_road", "red_light_run", "progression", "vmax_score", "nuplan_score")
+REALISM = ("wosac_2025", "wosac_2024", "wosac_2023", "wosac_kinematic", "wosac_interactive", "wosac_map", "wosac_min_ade_m")
 COUNTED = ("success_rate", "clean_success_rate", "collision_rate", "road_edge_rate", "mean_time_to_goal_s")  # of protocols without scores
 ROUTED = ("clean_completion_rate", "route_completion", "red_light_rate")  # of those with routes
 UNTRAINED = ", untrained"  # ending of the label of a baseline
@@ -39,6 +40,8 @@ def select_policies(table: Mapping[str, Content]) -> dict[str, Content]:
 def choose_metrics(summary: Mapping[str, Summary]) -> tuple[str, ...]:
     """Chooses the columns: those of scores where any row has a score, else rates of events."""
     found = set().union(*summary.values())
+    if "wosac_2025" in found:
+        return REALISM
     return SCORED if "vmax_score" in found else (*COUNTED, *(name for name in ROUTED if name in found))
 
 

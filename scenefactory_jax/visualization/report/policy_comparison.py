@@ -13,6 +13,7 @@ from scenefactory_jax.visualization.report.planner_table import name_policy
 
 SCORED = ("vmax_score", "nuplan_score", "accuracy", "overlap", "at_fault_collision", "off_road", "red_light_run", "progression")
 COUNTED = ("success_rate", "clean_success_rate", "clean_completion_rate", "collision_rate", "road_edge_rate", "red_light_rate")
+REALISM = ("wosac_2025", "wosac_2024", "wosac_2023", "wosac_min_ade_m")
 LEVEL = 0.05
 
 
@@ -44,13 +45,14 @@ def compare_policies(records: Mapping[str, Records], resampling: Mapping[str, in
 
 
 def compare_pairs(pairs: Mapping[str, Pair], resampling: Mapping[str, int], *, heading: str) -> list[str]:
-    """Formats a table: a row for each metric of SCORED, or of COUNTED where there are no scores, a column a pair, marked by Holm's rule.
+    """Formats a table: a row for each metric of SCORED or REALISM, or of COUNTED where there are no scores, a column a pair, marked by
+    Holm's rule.
 
     Raises:
         RecordsError: a pair of different scenes.
     """
     differences = {name: statistics.difference(pair.before, pair.after, **resampling) for name, pair in pairs.items()}
-    compared = SCORED if any(SCORED[0] in estimates for estimates in differences.values()) else COUNTED
+    compared = next((names for names in (SCORED, REALISM) if any(names[0] in row for row in differences.values())), COUNTED)
     found = {(name, metric): row[metric] for name, row in differences.items() for metric in compared if metric in row}
     adjusted = statistics.adjust_holm({key: estimate.p for key, estimate in found.items() if estimate.p is not None})
     metrics = [metric for metric in compared if any((name, metric) in found for name in pairs)]
