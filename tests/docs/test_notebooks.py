@@ -32,11 +32,15 @@ SHORTER = {  # how well it learns is for other tests: notebook -> what a test ru
     ),
     "07_failures": ({"heldout.count=16": "heldout.count=2"}, "outputs/snow/failures-strict-*.png"),
     "08_own_dataset": ({'"iterations=40"': f'"iterations=2", {SHORT}'}, "outputs/quality/quality.md"),
+    "09_learners": (
+        {"buffer=100000": "buffer=5000", '"iterations=60"': f'"iterations=2", {SHORT}', '"iterations=80"': f'"iterations=2", {SHORT}'},
+        "runs/sac-*/evaluation/report.md",
+    ),
 }
 FIGURES = {"01_quickstart": 6, "02_scenes": 4, "03_own_algorithm": 2, "04_friction": 5, "05_ppo": 2, "06_own_parts": 1, "07_failures": 2}
-FIGURES |= {"08_own_dataset": 3}
+FIGURES |= {"08_own_dataset": 3, "09_learners": 1}
 # XLA without its costly passes, for programs that run for a moment; the others find what other tests compiled
-QUICK = ("04_friction", "05_ppo", "06_own_parts", "07_failures", "08_own_dataset")
+QUICK = ("04_friction", "05_ppo", "06_own_parts", "07_failures", "08_own_dataset", "09_learners")
 
 nbformat = pytest.importorskip("nbformat", reason="needs nbformat: pip install scenefactory_jax[dev]")
 
