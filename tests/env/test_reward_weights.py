@@ -11,7 +11,9 @@ from support.hand_scenes import scene_of
 
 import scenefactory_jax
 from scenefactory_jax.core.instantiate import ConfigError
-from scenefactory_jax.env import observations, rewards
+from scenefactory_jax.data.loading.scene_source import Scenes
+from scenefactory_jax.env import environment, observations, rewards
+from scenefactory_jax.evaluation import episode_records
 
 pytestmark = pytest.mark.usefixtures("quickly")
 
@@ -138,3 +140,19 @@ def test_showing_weights_that_nobody_draws_is_refused():
     config = {**with_ranges(), "reward": scenefactory_jax.load_config("task")["reward"]}
     with pytest.raises(ConfigError, match=r"observations\.reward_weights: expected a reward term with a range"):
         build_env(config).reset(jax.random.key(0), scene_of(CARS, GOALS))
+
+
+def test_the_episodes_of_an_evaluation_have_held_weights(monkeypatch):
+    """The environment that an evaluation builds: neither training's respawns nor its draws."""
+    built = []
+
+    def build(config):
+        built.append(config)
+        raise InterruptedError
+
+    monkeypatch.setattr(environment, "make_env", build)
+    scenes = Scenes(jax.tree.map(lambda leaf: jnp.asarray(leaf)[None], scene_of(CARS, GOALS)), ("street",), "")
+    with pytest.raises(InterruptedError):
+        numbers = {"repeats": 1, "seed": 0}
+        episode_records.make_episode_runner(with_ranges(), scenes, settings=numbers, worlds=0)
+    assert {name: built[0]["reward"][name]["held"] for name in RANGES} == {"goal": 40.0, "progress": 2.0, "idle": -1.0}
