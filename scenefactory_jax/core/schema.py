@@ -62,6 +62,7 @@ Positive = Annotated[float, Bounds(above=0)]
 Fraction = Annotated[float, Bounds(min=0, max=1)]
 Range = Annotated[tuple[float, float], Bounds(min=0, is_range=True)]  # [min, max]
 CountRange = Annotated[tuple[int, int], Bounds(min=0, is_range=True)]
+Weight = float | Annotated[tuple[float, float], Bounds(is_range=True)]  # a number, or a range that it is drawn from
 
 
 def check(config: Any, schema: type, *, where: str = "") -> None:

@@ -269,6 +269,7 @@ class State:
     route: RouteState
     traffic: Any = ()  # the background traffic's own pytree
     history: Any = ()  # past positions, where an observation needs them
+    reward_weights: Any = ()  # those that agents drew, term -> Float[Array, "A"], where a reward term has a range of weights
 
 
 @pytree_dataclass

@@ -37,6 +37,8 @@ from scenefactory_jax.env import history, observations, rewards, route_following
 from scenefactory_jax.env.history import HistorySpec
 from scenefactory_jax.weather import friction, rain, road_condition
 
+WEIGHTS = 0x77616765  # folded into the key of an agent's start, for its reward weights: apart from the numbers that others fold or split
+
 
 @dataclasses.dataclass(frozen=True)
 class Timing:
@@ -110,7 +112,7 @@ class EnvParts(NamedTuple):
     advance_route: Callable[..., RouteState]  # (scene, state before, motion after, speed=) -> state of the routes after
     compute_metrics: Callable[[Scene, State, State], StepMetrics]
     evaluate_termination: Callable[[StepMetrics, Events, Bool[Array, " A"]], tuple[Events, Bool[Array, " A"]]]
-    terms: Mapping[str, tuple[float, rewards.Term]]
+    terms: rewards.Weights
     groups: Mapping[str, observations.Group]
     episode_steps: int  # control steps after which a world is truncated
     control_dt: float  # s
@@ -138,7 +140,8 @@ def make_parts(config: Mapping[str, Any]) -> EnvParts:
     context: dict[str, Any] = {"physics_dt": 1.0 / read.timing.physics_hz, "control_dt": 1.0 / read.timing.control_hz}
     mu = friction.make(config["weather"]["friction"])
     package = __name__.rpartition(".")[0]
-    terms, groups = rewards.make(read.reward, **context), observations.make(read.observations, friction=mu, **context)
+    terms = rewards.make(read.reward, **context)
+    groups = observations.make(read.observations, friction=mu, reward_ranges=rewards.read_ranges(read.reward), **context)
     readers = [*groups.values(), *(term for _, term in terms.values())]
     return EnvParts(
         dynamics=instantiate(read.dynamics, builtins="scenefactory_jax.dynamics", where="dynamics", friction=mu, **context)(),
@@ -290,6 +293,7 @@ def _init_state(parts: EnvParts, key: PRNGKeyArray, scene: Scene, step: Int[Arra
         route=route_following.start_routes(agents),
         traffic=others,
         history=history.start_history(parts.history, scene, motion, agents, step, control_dt=parts.control_dt),
+        reward_weights=rewards.draw_weights(jax.random.fold_in(body_key, WEIGHTS), parts.terms, count),
     )
     return to_strong_type(state)
 
@@ -364,7 +368,9 @@ def _respawn(parts: EnvParts, scene: Scene, state: State, *, clear_m: float) -> 
     body = parts.dynamics.init(body_key, replace(scene, agents=new))
     waiting = ~state.active & new.present & is_finite(parts.dynamics.read(body))
     clear = spawning.is_clear(new, state.motion.position[:, :2], state.active, scene.traffic, clear_m=clear_m)
-    return start_agents(parts, replace(state, key=key), new, body, waiting & clear)
+    weights = rewards.draw_weights(jax.random.fold_in(body_key, WEIGHTS), parts.terms, len(waiting))
+    weights = tree_where(waiting & clear, weights, state.reward_weights)
+    return start_agents(parts, replace(state, key=key, reward_weights=weights), new, body, waiting & clear)
 
 
 def start_agents(parts: EnvParts, state: State, new: Agents, body: Any, starts: Bool[Array, " A"]) -> State:

@@ -2,22 +2,37 @@
 
 A term is a config entry `{_target_: progress, weight: 2.0, limit_m: 2.0}`: `weight` multiplies the term, the other keys are its parameters.
 A term from another module has a dotted target: `{_target_: my_terms.jerk, weight: -0.1}`.
+
+A weight may be a range, [low, high]: each agent draws its own at every start and keeps it until the next (`State.reward_weights`), as in
+Gigaflow (arXiv:2502.03349); the observation group `reward_weights` shows it. `held: 3.0` beside the range gives all agents that weight.
 """
 
 from collections.abc import Callable, Mapping
-from typing import Any
+from typing import Any, NamedTuple
 
+import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, PRNGKeyArray
 
 from scenefactory_jax.core.geometry import safe_norm
 from scenefactory_jax.core.instantiate import instantiate
-from scenefactory_jax.core.schema import ConfigError, Fraction, NonNegative, Positive, read_value
+from scenefactory_jax.core.schema import ConfigError, Fraction, NonNegative, Positive, Weight, read_value
 from scenefactory_jax.core.types import RewardInput
 from scenefactory_jax.env import route_following
 from scenefactory_jax.env.termination import EventName
 
 Term = Callable[[RewardInput], Float[Array, " A"]]
+
+
+class WeightRange(NamedTuple):
+    """Weights of a term that agents draw, uniformly, or one of them that all agents have."""
+
+    low: float
+    high: float
+    held: float | None
+
+
+Weights = Mapping[str, tuple[float | WeightRange, Term]]  # name -> (weight, term)
 
 
 def event(step: RewardInput, *, name: EventName) -> Float[Array, " A"]:
@@ -135,7 +150,9 @@ def _inverse_ttc(time: Float[Array, " A"], *, alpha_s: float, limit: float, floo
     return jnp.where(time < floor_s, limit, jnp.minimum(alpha_s / jnp.maximum(time, floor_s), limit))
 
 
-def make(entries: Mapping[str, Mapping[str, Any] | None], *, where: str = "reward", **context: Any) -> dict[str, tuple[float, Term]]:
+def make(
+    entries: Mapping[str, Mapping[str, Any] | None], *, where: str = "reward", **context: Any
+) -> dict[str, tuple[float | WeightRange, Term]]:
     """Binds config entries: name -> (weight, term). An entry of null is left out, so that an override can drop a term.
 
     Raises:
@@ -147,15 +164,55 @@ def make(entries: Mapping[str, Mapping[str, Any] | None], *, where: str = "rewar
             continue
         if not isinstance(entry, Mapping) or "weight" not in entry:
             raise ConfigError(f"{where}.{name}.weight: missing; a reward term is {{_target_: ..., weight: ..., its parameters}}")
-        weight = read_value(entry["weight"], float, where=f"{where}.{name}.weight")
-        numbers = {key: value for key, value in entry.items() if key != "weight"}
-        terms[name] = (float(weight), instantiate(numbers, builtins=__name__, where=f"{where}.{name}", **context))
+        weight = _read_weight(entry, where=f"{where}.{name}")
+        own = ("weight", "held") if isinstance(weight, WeightRange) or entry.get("held") is None else ("weight",)
+        numbers = {key: value for key, value in entry.items() if key not in own}
+        terms[name] = (weight, instantiate(numbers, builtins=__name__, where=f"{where}.{name}", **context))
     return terms
 
 
-def sum_terms(step: RewardInput, terms: Mapping[str, tuple[float, Term]]) -> tuple[Float[Array, " A"], dict[str, Float[Array, " A"]]]:
+def _read_weight(entry: Mapping[str, Any], *, where: str) -> float | WeightRange:
+    weight = read_value(entry["weight"], Weight, where=f"{where}.weight")
+    if not isinstance(weight, tuple):
+        return float(weight)
+    held = read_value(entry.get("held"), float | None, where=f"{where}.held")
+    if held is not None and not weight[0] <= held <= weight[1]:
+        raise ConfigError(f"{where}.held: expected a number of the range {where}.weight={list(weight)}, or null, got {held:g}")
+    return WeightRange(weight[0], weight[1], held)
+
+
+def read_ranges(entries: Mapping[str, Mapping[str, Any] | None], *, where: str = "reward") -> dict[str, WeightRange]:
+    """Reads the ranges of the config entries whose weight is one, by name."""
+    given = {name: entry for name, entry in entries.items() if isinstance(entry, Mapping) and "weight" in entry}
+    weights = {name: _read_weight(entry, where=f"{where}.{name}") for name, entry in given.items()}
+    return {name: weight for name, weight in weights.items() if isinstance(weight, WeightRange)}
+
+
+def hold_weights(entries: Mapping[str, Any]) -> dict[str, Any]:
+    """Holds the weights of ranges for an evaluation: where `held` gives none, in the middle."""
+    held = {name: (span.low + span.high) / 2 if span.held is None else span.held for name, span in read_ranges(entries).items()}
+    return {**entries, **{name: {**entries[name], "held": weight} for name, weight in held.items()}}
+
+
+def draw_weights(key: PRNGKeyArray, terms: Weights, agents: int) -> Any:
+    """Draws the weights of all agents at their start, name -> Float[Array, "A"]; () where no term has a range."""
+    ranges = {name: weight for name, (weight, _) in terms.items() if isinstance(weight, WeightRange)}
+    if not ranges:
+        return ()
+    keys = jax.random.split(key, len(ranges))
+    return {name: _draw(one, span, agents) for one, (name, span) in zip(keys, sorted(ranges.items()), strict=True)}
+
+
+def _draw(key: PRNGKeyArray, span: WeightRange, agents: int) -> Float[Array, " A"]:
+    if span.held is not None:
+        return jnp.full(agents, span.held, jnp.float32)
+    return jax.random.uniform(key, (agents,), jnp.float32, span.low, span.high)
+
+
+def sum_terms(step: RewardInput, terms: Weights) -> tuple[Float[Array, " A"], dict[str, Float[Array, " A"]]]:
     """Computes the sum of the weighted terms, and each of them; zero for agents that were not active before the step."""
     active = step.before.active
-    parts = {name: jnp.where(active, weight * term(step), 0.0).astype(jnp.float32) for name, (weight, term) in terms.items()}
+    weights = {name: step.before.reward_weights[name] if isinstance(weight, WeightRange) else weight for name, (weight, _) in terms.items()}
+    parts = {name: jnp.where(active, weights[name] * term(step), 0.0).astype(jnp.float32) for name, (_, term) in terms.items()}
     total = sum(parts.values(), start=jnp.zeros(active.shape, jnp.float32))
     return total, parts

@@ -12,7 +12,7 @@ from scenefactory_jax.core.pytree import replace, unchecked
 from scenefactory_jax.core.trajectory import TrafficBoxes, Trajectory
 from scenefactory_jax.core.types import SURFACES, Boxes, Scene, State, Weather
 from scenefactory_jax.data.loading import scene_source
-from scenefactory_jax.env import environment
+from scenefactory_jax.env import environment, rewards
 from scenefactory_jax.env.rollout import RolloutState, rollout, start_rollout
 from scenefactory_jax.evaluation import episodes, failures, noisy_start, route_signals, scoring, wosac
 from scenefactory_jax.evaluation.failure_signals import FAILURE_EVENTS, Moment, SignalThresholds
@@ -142,7 +142,8 @@ def _make_driver(
 ) -> Callable[[Any, Scene, Array], _Driven]:
     """Returns a function (parameters, worlds, keys) that runs an episode in every world, until all worlds are done."""
     spawning = {**config["spawning"], "respawn_clearance_m": None}  # one episode an agent, also if training respawned it
-    env, policy = environment.make_env({**config, "spawning": spawning}), make_policy(config)
+    task = {**config, "spawning": spawning, "reward": rewards.hold_weights(config["reward"])}
+    env, policy = environment.make_env(task), make_policy(config)
     control_hz, limit = float(config["timing"]["control_hz"]), environment.episode_steps(config["timing"])
     chunk = -(-settings["chunk_steps"] // env.action_repeat) * env.action_repeat  # whole actions
     thresholds = settings["failures"]

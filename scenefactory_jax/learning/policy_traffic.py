@@ -23,7 +23,7 @@ from scenefactory_jax.core.pytree import replace
 from scenefactory_jax.core.schema import ConfigError, Count, NonNegative
 from scenefactory_jax.core.track_interpolation import SNAP
 from scenefactory_jax.core.types import AgentLog, Agents, Boxes, Dynamics, Env, Observation, RoadUser, Scene, State, Traffic
-from scenefactory_jax.env import environment, history, observations, route_following, spawning, step_metrics, termination
+from scenefactory_jax.env import environment, history, observations, rewards, route_following, spawning, step_metrics, termination
 from scenefactory_jax.env.environment import EnvParts
 from scenefactory_jax.env.termination import EventName, Termination
 from scenefactory_jax.env.traffic.idm import SIDE_M
@@ -155,7 +155,8 @@ def make_parts(trained: TrainedPolicy, dynamics: Dynamics, *, ending: list[Event
     """
     try:
         timing, actions, metrics = (schema.read(trained.config[name], kind, where=name) for name, kind in READ.items())
-        groups = observations.make(trained.config["observations"], physics_dt=physics_dt, control_dt=control_dt)
+        ranges = rewards.read_ranges(trained.config.get("reward", {}))
+        groups = observations.make(trained.config["observations"], physics_dt=physics_dt, control_dt=control_dt, reward_ranges=ranges)
         map_action = instantiate(actions.command, builtins="scenefactory_jax.env.actions", where="actions.command")
         spec = history.make_spec(groups.values(), control_dt=control_dt)
     except ConfigError as error:

@@ -83,6 +83,6 @@ def test_a_number_beyond_its_bounds_is_refused(value, bounds, message):
 def test_reward_entries_need_a_weight():
     with pytest.raises(ConfigError, match=r"reward.idle.weight: missing"):
         rewards.make({"idle": {"_target_": "idle"}})
-    with pytest.raises(ConfigError, match=r"reward.idle.weight: expected a number, got 'x'"):
+    with pytest.raises(ConfigError, match=r"reward.idle.weight: expected a number or \[min, max\], got 'x'"):
         rewards.make({"idle": {"_target_": "idle", "weight": "x"}})
     assert set(rewards.make({"idle": {"_target_": "idle", "weight": -1}, "goal": None})) == {"idle"}

@@ -50,7 +50,10 @@ def build_env(config, *, draw=spawning.logged, steps=1500, respawn=None, ending=
         compute_metrics=functools.partial(step_metrics.compute, config=metrics, control_dt=1 / 30),
         evaluate_termination=functools.partial(termination.evaluate, ending=ending or config["termination"]["ending"]),
         terms=rewards.make(config["reward"]),
-        groups=observations.make({**config["observations"], "road": {**config["observations"]["road"], "count": 40}}),
+        groups=observations.make(
+            {**config["observations"], "road": {**config["observations"]["road"], "count": 40}},
+            reward_ranges=rewards.read_ranges(config["reward"]),
+        ),
         episode_steps=steps,
         control_dt=1 / 30,
         respawn_clearance_m=respawn,

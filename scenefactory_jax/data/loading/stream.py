@@ -14,6 +14,7 @@ state, it makes a resumed run equal to an unbroken one, bit for bit.
 """
 
 import contextlib
+import dataclasses
 import functools
 import logging
 import time
@@ -21,7 +22,6 @@ from collections import deque
 from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
 from concurrent.futures import TimeoutError as Late
-from dataclasses import dataclass
 from typing import Annotated, Any, NamedTuple
 
 import jax
@@ -31,11 +31,13 @@ from jax.sharding import Mesh
 from scenefactory_jax.core import schema, sharding
 from scenefactory_jax.core.instantiate import ConfigError, instantiate
 from scenefactory_jax.core.parallel.task_map import open_pool
+from scenefactory_jax.core.raw_scene import SceneError
 from scenefactory_jax.core.safe_names import escape_for_terminal
 from scenefactory_jax.core.schema import Bounds, Count, Fraction, Positive, Seed
 from scenefactory_jax.core.types import Scene
 from scenefactory_jax.data.loading import batches, samplers
 from scenefactory_jax.data.loading.batches import Batch, BatchLoader
+from scenefactory_jax.data.loading.curriculum import Curriculum, Levels, compute_difficulty, sort_into_levels, take_rows
 from scenefactory_jax.data.loading.scene_source import SceneSource, make_packing, open_source
 from scenefactory_jax.data.loading.scenes_config import check_config
 
@@ -43,7 +45,7 @@ LOG = logging.getLogger(__name__)
 SHOWN = 10  # refused scenes that are reported by name
 
 
-@dataclass(frozen=True)
+@dataclasses.dataclass(frozen=True)
 class StreamConfig:
     """The group `stream`; see conf/stream/base.yaml."""
 
@@ -58,6 +60,7 @@ class StreamConfig:
     headroom: Annotated[float, Bounds(min=1)]
     memory_gib: Positive
     capacity: dict[str, int | None]
+    curriculum: Curriculum | None = None
 
 
 class PlacedScenes(NamedTuple):
@@ -85,6 +88,7 @@ class SceneStream:
         columns = {name: np.asarray(state[name], kind) for name, kind in (("draws", int), ("episodes", float), ("successes", float))}
         self._table = samplers.SceneOutcomes(**columns, endless=source.count is None)
         self._sizes, self._exchanges, self._counts = dict(state["sizes"]), state["exchanges"], dict(state["counts"])
+        self._levels = None if settings.curriculum is None else Levels(settings.curriculum, state["curriculum"])
         self._placed = np.asarray(state["placed"], int)  # the scene of each world
         self._record = np.asarray(state["record"], int)  # episodes and successes of each world since its scene was placed
         self._waiting = deque((indices, load(indices)) for indices in (np.asarray(part, int) for part in state["waiting"]))
@@ -124,11 +128,21 @@ class SceneStream:
             self._waiting.append((indices, self._load(indices)))
 
     def note(self, episodes: np.ndarray, successes: np.ndarray) -> dict[str, float | int]:
-        """Records the outcomes of the worlds' agents; returns numbers for the run's metrics."""
+        """Records the outcomes of the worlds' agents; returns numbers for the run's metrics.
+
+        Where they end a level of the curriculum, scenes of that level that no world has got yet make way for those of the next.
+        """
         self._record = np.stack([episodes, successes]).astype(int)
+        row: dict[str, float | int] = {}
+        if self._levels is not None:
+            promoted, row = self._levels.promote(self._count_outcomes())
+            if promoted:
+                LOG.info(f"curriculum: level {self._levels.level + 1}, {len(self._levels.rows)} scenes")
+                self._waiting.clear()
+                self.draw()
         waited, self._waited_s = self._waited_s, 0.0
         counts = {f"stream/{name}": count for name, count in self._counts.items()}
-        return {"stream/scenes": int((self._table.draws > 0).sum()), **counts, "stream/wait_s": waited}
+        return {"stream/scenes": int((self._table.draws > 0).sum()), **counts, "stream/wait_s": waited, **row}
 
     def state(self) -> dict[str, Any]:
         """All that the next samples depend on, as JSON values."""
@@ -141,15 +155,22 @@ class SceneStream:
             "waiting": [indices.tolist() for indices, _ in self._waiting],
             "counts": self._counts,
             **{name: getattr(self._table, name).tolist() for name in ("draws", "episodes", "successes")},
+            **({} if self._levels is None else {"curriculum": self._levels.state()}),
         }
 
+    def _count_outcomes(self) -> samplers.SceneOutcomes:
+        """The outcomes so far, with those of the running worlds."""
+        return samplers.update_outcomes(self._table, self._placed, *self._record, memory=self._settings.memory)
+
     def _sample(self, count: int) -> np.ndarray:
-        """The sampler's next scenes; the outcomes include those of the running worlds."""
-        table = samplers.update_outcomes(self._table, self._placed, *self._record, memory=self._settings.memory)
+        """The sampler's next scenes, of a curriculum's level; the outcomes include those of the running worlds."""
+        table, rows = self._count_outcomes(), None if self._levels is None else self._levels.rows
+        table = table if rows is None else take_rows(table, rows)
         indices = np.asarray(self._sampler(table, count))
-        limit = np.inf if self._source.count is None else self._source.count
+        limit = np.inf if table.endless else len(table.draws)
         if indices.shape != (count,) or indices.dtype.kind not in "iu" or (indices < 0).any() or (indices >= limit).any():
             raise ConfigError(f"stream.sampler: expected {count} integers >= 0 and < {limit:g}, got {indices!r}")
+        indices = indices if rows is None else rows[indices]
         self._table = samplers.count_draws(self._table, indices)
         return indices
 
@@ -186,6 +207,27 @@ def _make_state(source: SceneSource, sizes: Mapping[str, int], worlds: int) -> d
     }
 
 
+def _make_levels(loader: BatchLoader, settings: Curriculum) -> dict[str, Any]:
+    """The state of a curriculum at its start; reads and packs every scene once."""
+    count = loader.source.count
+    assert count is not None
+    work = functools.partial(_measure_difficulty, traffic_weight=settings.traffic_weight)
+    difficulty = np.fromiter(loader.each(work, range(count)), float, count)
+    levels = sort_into_levels(difficulty, settings.levels)
+    low, high = np.nanmin(difficulty), np.nanmax(difficulty)
+    left_out = f"; {np.isnan(difficulty).sum()} cannot be used" if np.isnan(difficulty).any() else ""
+    LOG.info(f"curriculum: {settings.levels} levels of {count} scenes, difficulty {low:.0f} to {high:.0f} m{left_out}")
+    return {"level": 0, "levels": levels.tolist()}
+
+
+def _measure_difficulty(read: Callable[[], Scene], *, traffic_weight: float) -> float:
+    """The difficulty of a scene; NaN of one that cannot be used."""
+    try:
+        return compute_difficulty(read(), traffic_weight=traffic_weight)
+    except SceneError:
+        return np.nan
+
+
 @contextlib.contextmanager
 def open_stream(config: Mapping[str, Any], *, mesh: Mesh | None, before: Mapping[str, Any] | None) -> Iterator[SceneStream]:
     """The stream of a config, from its start or from the state `before`; its threads and processes end with the context.
@@ -204,6 +246,8 @@ def open_stream(config: Mapping[str, Any], *, mesh: Mesh | None, before: Mapping
     sampler = instantiate(settings.sampler, builtins=samplers, where="stream.sampler", seed=config["seed"])
     swapped = min(worlds, int(np.ceil(settings.swap_fraction * worlds / devices)) * devices)  # an equal part on every device
     source = open_source(config["scenes"])
+    if settings.curriculum is not None and source.count is None:  # levels need all scenes: of a generator the first ones
+        source = dataclasses.replace(source, count=config["scenes"]["count"])
     if before is not None and before["source"] != source.identity:
         raise ConfigError(f"resume=true: the run streamed {_format(before['source'])}; now there are {_format(source.identity)}")
     with contextlib.ExitStack() as stack:
@@ -214,6 +258,8 @@ def open_stream(config: Mapping[str, Any], *, mesh: Mesh | None, before: Mapping
         if before is None:
             measure = functools.partial(batches.measure, loader, sample=settings.sample, headroom=settings.headroom)
             before = _make_state(source, measure(given=settings.capacity, seed=config["seed"]), worlds)
+            if settings.curriculum is not None:
+                before["curriculum"] = _make_levels(loader, settings.curriculum)
         sizes = before["sizes"]
         batches.require_memory(sizes, worlds + settings.prefetch * swapped, gib=settings.memory_gib)
 

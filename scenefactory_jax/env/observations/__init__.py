@@ -22,6 +22,7 @@ from scenefactory_jax.env.observations.metadrive import metadrive
 from scenefactory_jax.env.observations.neighbour_sets import closest_approach, neighbours
 from scenefactory_jax.env.observations.noise_vector import noise
 from scenefactory_jax.env.observations.planning import planning
+from scenefactory_jax.env.observations.reward_vector import reward_weights
 from scenefactory_jax.env.observations.road_set import road
 from scenefactory_jax.env.observations.route_vector import route
 from scenefactory_jax.env.observations.state_vectors import ego, friction_ahead, weather, yaw_rate_and_steer
@@ -37,6 +38,7 @@ __all__ += [
     "lights",
     "nearest_controls",
     "neighbours",
+    "reward_weights",
     "road",
     "route",
     "signs",
