@@ -45,7 +45,9 @@ def make_numbers(**changes):
 
 
 def make_discriminator(name):
-    return gail.make_discriminator(POLICY, make_numbers()) if name == "gail" else airl.make_discriminator(POLICY, make_numbers(), gamma=GAMMA)
+    if name == "gail":
+        return gail.make_discriminator(POLICY, make_numbers())
+    return airl.make_discriminator(POLICY, make_numbers(), gamma=GAMMA)
 
 
 def remembering_probe():
@@ -192,7 +194,8 @@ def test_only_pairs_of_the_expert_that_are_known_are_stored(course):
 
 def test_an_episode_that_does_not_fit_is_thinned():
     learner, stage = make_learner_constants("gail"), scenes(WORLDS, 1)
-    row = off_policy.describe_row(functools.partial(train_iteration.make_rows, learner), trainer.start_worlds(probe(), jax.random.key(0), stage))
+    worlds = trainer.start_worlds(probe(), jax.random.key(0), stage)
+    row = off_policy.describe_row(functools.partial(train_iteration.make_rows, learner), worlds)
     empty = replay_buffer.make_empty(row, groups=1, capacity=96)
     buffer = jax.jit(functools.partial(train_iteration.drive_expert, learner))(stage, jax.random.key(0), empty)
     assert 30 < int(buffer.filled[0]) < 70  # a quarter of 16 x 24 slots, of which half are known agents: 48
@@ -207,7 +210,7 @@ def test_configs_are_valid(name):
 
 
 def test_mistakes_are_named():
-    with pytest.raises(ConfigError, match=r"policy: learner gail needs one with an encoder; valid: policy=late_fusion, policy=actor_critic"):
+    with pytest.raises(ConfigError, match="policy: learner gail needs one with an encoder; valid: policy=late_fusion, policy=actor_critic"):
         gail.make_discriminator(Policy(POLICY.init, POLICY.apply), make_numbers())
     with pytest.raises(ConfigError, match=r"learner\.buffer: expected at least 24, 8 worlds x 3 agents, got 20"):
         make_learner("gail", buffer=20).init(jax.random.key(0), scenes(WORLDS))

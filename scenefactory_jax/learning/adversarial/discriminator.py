@@ -1,14 +1,12 @@
 """What a discriminator is, and its loss: binary cross-entropy between the expert's pairs of observations and the policy's.
 
-    D = sigmoid(score): the probability that a pair is the expert's
-    J = -mean log D over the expert's pairs - mean log(1 - D) over the policy's
+D = sigmoid(score) is the probability that a pair is the expert's; J = -mean log D (expert's pairs) - mean log(1 - D) (policy's pairs).
 """
 
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
-import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
 from scenefactory_jax.core.pytree import pytree_dataclass

@@ -12,12 +12,12 @@ import flax.linen as nn
 import jax
 import jax.numpy as jnp
 from jax.sharding import Mesh
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
 from scenefactory_jax.core.types import Env, Observation, Policy
 from scenefactory_jax.learning.adversarial import train_iteration
 from scenefactory_jax.learning.adversarial.config import AdversarialConfig
-from scenefactory_jax.learning.adversarial.discriminator import Discriminator, get_encoder
+from scenefactory_jax.learning.adversarial.discriminator import Discriminator, Pairs, get_encoder
 from scenefactory_jax.learning.networks.heads import Encoder, Head
 from scenefactory_jax.learning.trainer import Trainer
 
@@ -45,11 +45,15 @@ def make_discriminator(policy: Policy, config: AdversarialConfig) -> Discriminat
     """
     encoder = get_encoder(policy, learner="gail")
     network = PairTower(encoder, functools.partial(Head, tuple(config.hidden), 1, config.activation, "float32"))
-    return Discriminator(
-        init=lambda key, seen: network.init(key, seen, seen, jnp.ones(jax.tree.leaves(seen)[0].shape[:2], bool)),
-        score=lambda parameters, pairs: network.apply(parameters, pairs.observation, pairs.next_observation, pairs.follows)[..., 0],
-        reward=jax.nn.softplus,
-    )
+
+    def init(key: PRNGKeyArray, observation: Observation) -> Any:
+        return network.init(key, observation, observation, jnp.ones(jax.tree.leaves(observation)[0].shape[:2], bool))
+
+    def score(parameters: Any, pairs: Pairs) -> Float[Array, "*batch"]:
+        raw: Any = network.apply(parameters, pairs.observation, pairs.next_observation, pairs.follows)
+        return raw[..., 0]
+
+    return Discriminator(init, score, reward=jax.nn.softplus)
 
 
 def make(config: Mapping[str, Any], env: Env, policy: Policy, *, mesh: Mesh | None = None) -> Trainer:

@@ -17,7 +17,7 @@ from jax.sharding import Mesh
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from scenefactory_jax.core import schema, sharding
-from scenefactory_jax.core.pytree import replace, to_strong_type
+from scenefactory_jax.core.pytree import replace, to_strong_type, unchecked
 from scenefactory_jax.core.schema import ConfigError
 from scenefactory_jax.core.types import Env, Observation, Policy, Scene
 from scenefactory_jax.env import environment
@@ -72,7 +72,7 @@ def train_iteration(imitation: Imitation, train_state: TrainState, scenes: Scene
     metrics["reward"] = weighted_mean(reward, collected.samples.active.astype(jnp.float32), axis=ppo.axis)
     metrics["buffer"] = replay_buffer.count_rows(buffer, axis=ppo.axis).astype(jnp.float32)
 
-    samples = replace(collected.samples, reward=reward)
+    samples = unchecked(rollout.Sample, **vars(collected.samples) | {"reward": reward})  # annotated as those of one action
     train_state, rest = ppo_iteration.learn(ppo, replace(train_state, key=key), collected._replace(samples=samples), update_key)
     train_state = replace(train_state, learner={name: learnt}, buffer={name: buffer})
     return to_strong_type(train_state), rest | {f"{name}/{part}": value for part, value in metrics.items()}
