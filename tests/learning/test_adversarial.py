@@ -18,6 +18,7 @@ from scenefactory_jax.learning import checkpoint, off_policy, replay_buffer, tra
 from scenefactory_jax.learning.adversarial import airl, gail, train_iteration
 from scenefactory_jax.learning.adversarial.config import AdversarialConfig
 from scenefactory_jax.learning.adversarial.discriminator import Discriminator, Pairs, compute_loss
+from scenefactory_jax.learning.gaussian import clipped_log_probability
 from scenefactory_jax.learning.networks import late_fusion
 from scenefactory_jax.learning.trainer import get_policy_parameters
 
@@ -135,10 +136,16 @@ def make_learner_constants(name):
     return train_iteration.Imitation(name, constants, make_discriminator(name), expert, make_numbers(), 2, 16, 1)
 
 
-def test_density_is_of_the_numbers_that_are_read():
-    action, mean, log_std = jnp.array([[0.2, -0.4, 0.9]]), jnp.array([[0.0, 0.1, 0.0]]), jnp.array([-0.5, 0.2, -9.0])
-    expected = stats.norm.logpdf(action[:, :2], mean[:, :2], np.exp(log_std[:2])).sum()
-    np.testing.assert_allclose(train_iteration.find_density(make_learner_constants("airl"), action, mean, log_std), [expected], rtol=1e-5)
+def test_probability_is_of_what_the_environment_makes_of_an_action():
+    """The third number is not read; those beyond -1 and 1 are clipped; and all that can be made has the probability 1."""
+    action, mean, log_std = jnp.array([[0.2, -0.4, 0.9], [-1.3, 1.0, 0.0]]), jnp.array([0.3, 0.1, 0.0]), jnp.array([-0.5, 0.2, -9.0])
+    found = train_iteration.find_density(make_learner_constants("airl"), action, jnp.broadcast_to(mean, action.shape), log_std)
+    one, other = (stats.norm(mean[index], np.exp(log_std[index])) for index in (0, 1))
+    expected = [one.logpdf(0.2) + other.logpdf(-0.4), one.logcdf(-1.0) + other.logsf(1.0)]
+    np.testing.assert_allclose(found, expected, rtol=1e-5)
+    inside = np.linspace(-0.99999, 0.99999, 2001, dtype=np.float32)
+    of_all = np.exp(clipped_log_probability(jnp.array([*inside, -1.0, 1.0])[:, None], jnp.full((2003, 1), 0.3), jnp.zeros(1)))
+    assert np.trapezoid(of_all[:-2], inside) + of_all[-2:].sum() == pytest.approx(1.0, abs=1e-4)
 
 
 @pytest.fixture(scope="module")

@@ -23,7 +23,7 @@ class Pairs:
     observation: Observation
     next_observation: Observation  # anything, where nothing follows
     follows: Bool[Array, "*batch"]  # no event ended the agent
-    log_probability: Float[Array, "*batch"]  # of the action under the policy that acts in this iteration
+    log_probability: Float[Array, "*batch"]  # of the action, clipped, under the policy that acts in this iteration
     weight: Float[Array, "*batch"]
 
 

@@ -26,6 +26,7 @@ from scenefactory_jax.learning.adversarial.config import AdversarialConfig
 from scenefactory_jax.learning.adversarial.discriminator import Discriminator, Pairs, compute_loss
 from scenefactory_jax.learning.expert import make_expert
 from scenefactory_jax.learning.means import weighted_mean
+from scenefactory_jax.learning.networks.squashed import FULL
 from scenefactory_jax.learning.off_policy import Learnt
 from scenefactory_jax.learning.ppo import train_iteration as ppo_iteration
 from scenefactory_jax.learning.ppo.config import PPOConfig
@@ -126,8 +127,8 @@ def make_policy_pairs(imitation: Imitation, parameters: Any, collected: Collecte
 
 
 def find_density(imitation: Imitation, action: Array, mean: Array, log_std: Array) -> Float[Array, "*batch"]:
-    """Computes the log density of the numbers of an action that the environment reads."""
-    return gaussian.log_probability(*(x[..., : imitation.numbers] for x in (action, mean, log_std)))
+    """Computes the log probability of what the environment makes of an action: of the numbers that it reads, clipped."""
+    return gaussian.clipped_log_probability(*(x[..., : imitation.numbers] for x in (action, mean, log_std)))
 
 
 def expand(pairs: Pairs) -> Pairs:
@@ -245,6 +246,6 @@ def make(
 ) -> Trainer:
     """Builds the trainer of a config whose `learner` is one of adversarial imitation; `build` makes its discriminator."""
     own, ppo = off_policy.read_numbers(config, AdversarialConfig), schema.read(config["ppo"], PPOConfig, where="ppo")
-    steps, numbers = environment.episode_steps(config["timing"]), config["actions"]["numbers"]
+    steps, numbers = environment.episode_steps(config["timing"]), config["actions"].get("numbers", FULL)
     more = {"numbers": numbers, "episode_steps": steps, "mesh": mesh}
     return make_trainer(name, env, policy, build(own, ppo), ppo, own, make_expert(config), **more)
