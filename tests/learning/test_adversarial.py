@@ -7,10 +7,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from scipy import stats
-from support.probes import SMALL, STEERS, expert, ppo_config, probe, scenes
+from support.adversarial import GAMMA, POLICY, make_discriminator, make_learner, make_numbers
+from support.probes import STEERS, expert, ppo_config, probe, scenes
 
 from scenefactory_jax.cli import hydra_config as configs
-from scenefactory_jax.core import schema
 from scenefactory_jax.core.pytree import replace
 from scenefactory_jax.core.schema import ConfigError
 from scenefactory_jax.core.types import Policy
@@ -19,54 +19,11 @@ from scenefactory_jax.learning.adversarial import airl, gail, train_iteration
 from scenefactory_jax.learning.adversarial.config import AdversarialConfig
 from scenefactory_jax.learning.adversarial.discriminator import Discriminator, Pairs, compute_loss
 from scenefactory_jax.learning.gaussian import clipped_log_probability
-from scenefactory_jax.learning.networks import late_fusion
 from scenefactory_jax.learning.trainer import get_policy_parameters
 
 pytestmark = pytest.mark.usefixtures("quickly")
 
-WORLDS, GAMMA, ITERATIONS = 8, 0.9, 40
-NUMBERS = dict(
-    hidden=[16],
-    activation="tanh",
-    learning_rate=1e-2,
-    l2=1e-5,
-    passes=2,
-    batch=64,
-    expert={},
-    expert_every=2,
-    expert_steps=16,
-    buffer=512,
-    storage="float32",
-)
-POLICY = late_fusion.make(**SMALL)
-
-
-def make_numbers(**changes):
-    return schema.read(NUMBERS | changes, AdversarialConfig, where="learner")
-
-
-def make_discriminator(name):
-    if name == "gail":
-        return gail.make_discriminator(POLICY, make_numbers())
-    return airl.make_discriminator(POLICY, make_numbers(), gamma=GAMMA)
-
-
-def remembering_probe():
-    """Agents of three steps that see their cue and what they did last: states say what an expert does."""
-
-    def observe(scene, state):
-        seen = jnp.stack([state.body, state.previous_action[:, 0]], axis=-1)
-        return {"cue": jnp.where(state.active[:, None], seen, 0.0)}
-
-    return probe(life=3)._replace(observe=observe)
-
-
-def make_learner(name, **changes):
-    numbers = ppo_config(learning_rate=1e-2, gamma=GAMMA)
-    judge, env = make_discriminator(name), remembering_probe()
-    return train_iteration.make_trainer(
-        name, env, POLICY, judge, numbers, make_numbers(**changes), expert, numbers=2, episode_steps=1000, mesh=None
-    )
+WORLDS, ITERATIONS = 8, 40
 
 
 def make_pairs(seen, after=None, follows=True, density=0.0):
