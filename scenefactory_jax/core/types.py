@@ -360,3 +360,4 @@ class Policy(NamedTuple):
     init: Callable[[PRNGKeyArray, Observation], Any]
     apply: Callable[[Any, Observation], tuple[Array, Array, Array]]
     networks: Any = None  # `learning.networks.squashed.Networks` of the learners that need more than `apply`
+    encoder: Any = None  # `learning.networks.heads.Encoder`: makes another one as the policy's, for networks that a learner adds

@@ -20,6 +20,19 @@ def log_probability(
     return -0.5 * jnp.sum(z**2 + 2.0 * log_std + jnp.log(2.0 * jnp.pi), axis=-1)
 
 
+def clipped_log_probability(
+    action: Float[Array, "*batch D"], mean: Float[Array, "*batch D"], log_std: Float[Array, "*#batch D"]
+) -> Float[Array, "*batch"]:
+    """Computes the log probability of an action after its clipping to [-1, 1]: inside a density, at the edges of all that lies beyond.
+
+    The entropy of what is made has a bound, as that of the Gaussian does not.
+    """
+    inverse = jnp.exp(-log_std)
+    inside = -0.5 * (((action - mean) * inverse) ** 2 + 2.0 * log_std + jnp.log(2.0 * jnp.pi))
+    below, above = jax.scipy.special.log_ndtr((-1.0 - mean) * inverse), jax.scipy.special.log_ndtr((mean - 1.0) * inverse)
+    return jnp.sum(jnp.where(action <= -1.0, below, jnp.where(action >= 1.0, above, inside)), axis=-1)
+
+
 def entropy(log_std: Float[Array, " D"]) -> Float[Array, ""]:
     """Computes the differential entropy, nats."""
     return jnp.sum(log_std + 0.5 * jnp.log(2.0 * jnp.pi * jnp.e))

@@ -253,7 +253,7 @@ def init_train_state(parts: Sequence[Rounds], key: PRNGKeyArray, scenes: Scene, 
         if config.buffer < config.unroll * count * agents:
             product = f"unroll {config.unroll} x {count} worlds x {agents} agents"
             raise ConfigError(f"learner.{rounds.key}: expected at least {config.unroll * count * agents}, {product}, got {config.buffer}")
-        row = describe_row(rounds.learner, worlds)
+        row = describe_row(rounds.learner.make_rows, worlds)
         needed += replay_buffer.check_memory(row, config.buffer, devices=rounds.devices, taken=needed, key=f"learner.{rounds.key}")
         buffers[rounds.name] = replay_buffer.make_empty(row, groups=shards, capacity=config.buffer // shards)
         learner_key = jax.random.fold_in(trainer.split_key(key)[0], index)
@@ -262,14 +262,14 @@ def init_train_state(parts: Sequence[Rounds], key: PRNGKeyArray, scenes: Scene, 
     return trainer.copy_leaves(replace(train_state, learner=learner, optimizer=optimizer, buffer=buffers))
 
 
-def describe_row(learner: Learner, worlds: Worlds) -> Any:
+def describe_row(make_rows: Callable[[Transition], tuple[Any, Array]], worlds: Worlds) -> Any:
     """Shapes and types of a row."""
 
     def make(worlds: Worlds) -> Any:
         none, zero = jnp.zeros(worlds.state.active.shape, bool), jnp.zeros(worlds.state.active.shape)
         action = jnp.zeros((*zero.shape, 3))
         transition = Transition(worlds.observation, action, none, worlds.observation, Outcome(zero, none, none, none))
-        return learner.make_rows(jax.tree.map(lambda leaf: leaf[None], transition))[0]
+        return make_rows(jax.tree.map(lambda leaf: leaf[None], transition))[0]
 
     return jax.tree.map(lambda leaf: jax.ShapeDtypeStruct(leaf.shape[3:], leaf.dtype), jax.eval_shape(make, worlds))
 

@@ -78,6 +78,17 @@ def test_the_expert_of_a_run_follows_the_log(tmp_path):
         expert.make_expert(config | {"learner": config["learner"] | {"expert": {"_target_": "nothing"}}})
 
 
+def test_one_word_trains_gail(tmp_path):
+    """The expert drives in the first iteration; the environment's reward is still reported, the policy's is the discriminator's."""
+    small = ("learner.expert_steps=8", "learner.batch=64", "learner.buffer=512", "iterations=1", "evaluation.enable=false")
+    run = train(smoke(tmp_path / "run", "learner=gail", "spawning=logged", "dynamics=bicycle", *small))
+    [row] = run.metrics
+    assert row["gail/buffer"] > 0 and row["gail/skipped"] == row["ppo/skipped"] == 0.0
+    assert row["gail/reward"] > 0.0 and row["gail/loss"] == pytest.approx(2 * np.log(2), abs=0.7)
+    trained = sf.load_policy(run.folder)
+    jax.tree.map(np.testing.assert_array_equal, trained.parameters, get_policy_parameters(run.state))
+
+
 @pytest.mark.parametrize(
     "change, message",
     [

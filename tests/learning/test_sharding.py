@@ -86,6 +86,15 @@ def test_learners_off_policy_learn_the_same_on_two_devices():
     assert one["metrics"] == pytest.approx(both["metrics"], rel=1e-3, abs=1e-3)
 
 
+@pytest.mark.slow  # the parts are those of PPO and of the learners off policy
+def test_adversarial_imitation_learns_the_same_on_two_devices():
+    one, both = result(start("gail", visible=2, module="support.adversarial"))
+    assert both["same"] and (one["parts"], both["parts"]) == (1, 2)
+    for name in ("parameters", "rows"):
+        np.testing.assert_allclose(one[name], both[name], atol=2e-5)
+    assert one["metrics"] == pytest.approx(both["metrics"], rel=1e-3, abs=1e-4)
+
+
 def test_mistakes_are_named():
     with pytest.raises(ConfigError, match=r"ppo\.shards: expected a multiple of 1 devices, got 0"):
         make_trainer(probe(), shards=0)

@@ -48,7 +48,7 @@ def make(
         head = {"hidden": hidden, "activation": activation, "dtype": dtype, "activate_last": False}
         return squashed.make(bound, actor=actor, numbers=numbers, **head, **first)
     network = ActorCritic(bound, tuple(hidden), activation, shared_encoder, **first, dtype=dtype)
-    return Policy(network.init, network.apply)  # pyright: ignore[reportArgumentType]
+    return Policy(network.init, network.apply, encoder=bound)  # pyright: ignore[reportArgumentType]
 
 
 class ActorCritic(nn.Module):

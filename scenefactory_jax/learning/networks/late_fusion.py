@@ -87,12 +87,13 @@ def make(
         raise ConfigError(f"policy.mean_init: expected 3 numbers, throttle, steer and brake, got {mean_init}")
     architecture = Architecture(tuple(vector), tuple(named.items()), tuple(rows_default), tuple(trunk), activation, dtype, kernels)
     first = {"mean_init": tuple(map(float, mean_init)), "log_std_init": float(log_std_init), "actor_head_scale": float(actor_head_scale)}
+    encoder = functools.partial(Fusion, architecture)
     if actor == "gaussian":
         network = ActorCritic(architecture, **first)
-        policy = Policy(network.init, network.apply)  # pyright: ignore[reportArgumentType]
+        policy = Policy(network.init, network.apply, encoder=encoder)  # pyright: ignore[reportArgumentType]
     else:
         head = {"hidden": trunk, "activation": activation, "dtype": dtype, "activate_last": True}
-        policy = squashed.make(functools.partial(Fusion, architecture), actor=actor, numbers=numbers, **head, **first)
+        policy = squashed.make(encoder, actor=actor, numbers=numbers, **head, **first)
 
     def init(key: PRNGKeyArray, observation: Observation) -> Any:
         check_groups(observation)

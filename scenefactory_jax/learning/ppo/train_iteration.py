@@ -8,7 +8,7 @@ own worlds and samples; sums over samples, and with them gradients, are sums ove
 import dataclasses
 import functools
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -45,17 +45,37 @@ class PPO:
         return optax.chain(optax.clip_by_global_norm(self.config.max_grad_norm), adam)
 
 
+class Collected(NamedTuple):
+    """A rollout: what `rollout.collect_rollout` returns."""
+
+    worlds: rollout.Worlds
+    samples: rollout.Sample
+    counts: rollout.Counts
+    scene_stats: rollout.SceneStats
+
+
 def train_iteration(ppo: PPO, train_state: TrainState, scenes: Scene) -> tuple[TrainState, Metrics]:
     """Computes one iteration: rollout, advantages, epochs of minibatches, metrics."""
-    config, axis, parameters = ppo.config, ppo.axis, train_state.parameters
     rollout_key, update_key, key = jax.random.split(train_state.key, 3)
-    worlds, samples, counts, scene_stats = rollout.collect_rollout(
-        ppo.env, ppo.policy, parameters, scenes, train_state.worlds, rollout_key, horizon=config.horizon, axis=axis
-    )
+    collected = collect(ppo, train_state, scenes, rollout_key)
+    return learn(ppo, replace(train_state, key=key), collected, update_key)
+
+
+def collect(ppo: PPO, train_state: TrainState, scenes: Scene, key: PRNGKeyArray) -> Collected:
+    """Acts in all worlds."""
+    worlds, horizon = train_state.worlds, ppo.config.horizon
+    parts = rollout.collect_rollout(ppo.env, ppo.policy, train_state.parameters, scenes, worlds, key, horizon=horizon, axis=ppo.axis)
+    return Collected(*parts)
+
+
+def learn(ppo: PPO, train_state: TrainState, collected: Collected, key: PRNGKeyArray) -> tuple[TrainState, Metrics]:
+    """Learns from a rollout: advantages, epochs of minibatches, metrics."""
+    config, axis, parameters = ppo.config, ppo.axis, train_state.parameters
+    worlds, samples, counts, scene_stats = collected
     _, log_std, last_value = ppo.policy.apply(parameters, worlds.observation)
     batch = compute_batch(ppo, samples, last_value)
     size = minibatch_size(config, worlds.state.active.shape, groups=ppo.groups)
-    parameters, optimizer, metrics = update_epochs(ppo, train_state, batch, log_std, update_key, size=size)
+    parameters, optimizer, metrics = update_epochs(ppo, train_state, batch, log_std, key, size=size)
 
     metrics["explained_variance"] = loss.explained_variance(batch.value, batch.returns, batch.weight, axis=axis)
     counts = sharding.sum_over_devices(counts, axis)
@@ -66,7 +86,6 @@ def train_iteration(ppo: PPO, train_state: TrainState, scenes: Scene) -> tuple[T
         optimizer=optimizer,
         worlds=worlds,
         scene_stats=jax.tree.map(jnp.add, train_state.scene_stats, sharding.gather_over_devices(scene_stats, axis)),
-        key=key,
         iteration=train_state.iteration + 1,
         steps=trainer.add_steps(train_state.steps, counts["spawned"]),
     )
@@ -183,20 +202,35 @@ def make_trainer(env: Env, policy: Policy, config: PPOConfig, *, episode_steps: 
         mesh: of devices with the axis `sharding.AXIS`, that share the worlds; None: one device. With the same `shards` any number of
             devices learns the same, up to rounding.
     """
+    ppo, shards = make_constants(env, policy, config, mesh)
+    starts = episode_steps // env.action_repeat if config.stagger_episodes else 1
+    iterate = functools.partial(train_iteration, ppo)
+    return trainer.compile_trainer(functools.partial(init, ppo, shards, starts), iterate, env, starts=starts, mesh=mesh)
+
+
+def make_constants(env: Env, policy: Policy, config: PPOConfig, mesh: Mesh | None) -> tuple[PPO, int]:
+    """Joins the constants of all iterations; also the groups of worlds of all devices.
+
+    Raises:
+        ConfigError: shards that the devices do not divide.
+    """
     axis, devices = (None, 1) if mesh is None else (sharding.AXIS, mesh.size)
     shards = devices if config.shards is None else config.shards
     if shards < 1 or shards % devices:
         raise ConfigError(f"ppo.shards: expected a multiple of {devices} devices, got {shards}")
-    ppo = PPO(env, policy, config, axis, shards // devices)
-    starts = episode_steps // env.action_repeat if config.stagger_episodes else 1
+    return PPO(env, policy, config, axis, shards // devices), shards
 
-    def init(key: PRNGKeyArray, scenes: Scene) -> TrainState:
-        ema = config.parameter_ema_decay is not None
-        train_state = trainer.init_train_state(key, scenes, env, policy, ppo.optimizer, starts=starts, ema=ema)
-        minibatch_size(config, train_state.worlds.state.active.shape, groups=shards)
-        return train_state
 
-    return trainer.compile_trainer(init, functools.partial(train_iteration, ppo), env, starts=starts, mesh=mesh)
+def init(ppo: PPO, shards: int, starts: int, key: PRNGKeyArray, scenes: Scene) -> TrainState:
+    """Computes the train state before the first iteration; `shards`: of all devices, `starts`: see `trainer.start_worlds`.
+
+    Raises:
+        ConfigError: a rollout that does not divide into the minibatches.
+    """
+    ema = ppo.config.parameter_ema_decay is not None
+    train_state = trainer.init_train_state(key, scenes, ppo.env, ppo.policy, ppo.optimizer, starts=starts, ema=ema)
+    minibatch_size(ppo.config, train_state.worlds.state.active.shape, groups=shards)
+    return train_state
 
 
 def make(config: Mapping[str, Any], env: Env, policy: Policy, *, mesh: Mesh | None = None) -> Trainer:
