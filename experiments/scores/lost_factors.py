@@ -14,7 +14,8 @@ from scenefactory_jax.core import markdown
 from scenefactory_jax.evaluation.metrics.agent_metrics import METRICS
 
 FAULTS = ("at_fault_collision", "off_road", "red_light_run")  # the fewer the better; of the others 1 is best
-WHOLES = ("making_progress", "direction_compliance", "ttc_within_bound", "progression", "speed_compliance", "several_lanes_score", "comfort")
+WHOLES = ("making_progress", "direction_compliance", "ttc_within_bound", "progression")
+WHOLES += ("speed_compliance", "several_lanes_score", "comfort")
 NUPLAN = ("no_at_fault_collision", "drivable_area", "direction_compliance", "making_progress", "ttc_within_bound", "progress")
 WHOLES += tuple(f"nuplan_{name}" for name in (*NUPLAN, "speed_compliance", "comfort"))
 TOLERANCE = 0.01
