@@ -321,7 +321,7 @@ def test_a_study_stops_at_its_time_limit_and_says_what_is_missing(tmp_path, caps
         ({"compare": [["all scenes", "other"]]}, r"study\.compare\.0: expected one of all scenes, one scene, .*replay, got 'other'"),
         ({"compare": [["all scenes"]]}, r"study\.compare: expected pairs \[before, after\], got \['all scenes'\]"),
         ({"colour": "red"}, r"study\.colour: unknown key; valid: base, baselines"),
-        ({"protocols": ["lenient"]}, r"study\.protocols: expected one or more of goal_only, rules, strict, whole, got \['lenient'\]"),
+        ({"protocols": ["lenient"]}, r"study\.protocols: expected one or more of goal_only, rules, strict, vmax, whole, got \['lenient'\]"),
         ({"figures": ["pie"]}, r"study\.figures.*got 'pie'"),
         ({"baselines": {"f": {"of": "all scenes"}}}, r"study\.baselines\.f.*overrides"),
     ],
