@@ -185,7 +185,7 @@ def test_an_unknown_config_is_named():
         ("train", "resume=maybe", "resume: expected true or false, got 'maybe'"),
         ("train", "out=3", "out: expected a text or null, got 3"),
         ("train", "evaluation.protocols=strict", "evaluation.protocols: expected a list, each a text, got 'strict'"),
-        ("train", "evaluation.protocols=[sharp]", "protocols: expected one or more of goal_only, rules, strict, vmax, whole, got ['sharp']"),
+        ("train", "evaluation.protocols=[hard]", "protocols: expected one or more of goal_only, rules, strict, vmax, whole, got ['hard']"),
         ("train", "evaluation.protocols=[]", "evaluation.protocols: expected one or more of goal_only, rules, strict, vmax, whole, got []"),
         ("train", "evaluation.repeats=0", "evaluation.repeats: expected an integer >= 1, got 0"),
         ("train", "evaluation.video.fps=fast", "evaluation.video.fps: expected a number >= 0.1, got 'fast'"),
