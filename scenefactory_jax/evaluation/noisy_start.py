@@ -34,14 +34,14 @@ def perturb_starts(keys: Array, scene: Scene, noise: NoisyStart, *, past_rows: i
         keys: one a world.
         past_rows: rows of the log before the start, a tenth of a second apart.
     """
-
-    @jax.jit
-    def perturb(keys: Array, worlds: Scene) -> tuple[Agents, AgentLog]:
-        perturb_one = functools.partial(_perturb, noise=noise, past_rows=past_rows)
-        return jax.lax.map(lambda world: perturb_one(*world), (keys, worlds), batch_size=WORLDS_AT_ONCE)
-
-    agents, log = perturb(keys, replace(scene, road_grid=None))
+    agents, log = _perturb_all(keys, replace(scene, road_grid=None), noise=noise, past_rows=past_rows)
     return replace(scene, agents=agents, log=log)
+
+
+@functools.partial(jax.jit, static_argnames=("noise", "past_rows"))  # of the module: one program for all planners and repeats
+def _perturb_all(keys: Array, scene: Scene, *, noise: NoisyStart, past_rows: int) -> tuple[Agents, AgentLog]:
+    perturb_one = functools.partial(_perturb, noise=noise, past_rows=past_rows)
+    return jax.lax.map(lambda world: perturb_one(*world), (keys, scene), batch_size=WORLDS_AT_ONCE)
 
 
 def _perturb(key: PRNGKeyArray, scene: Scene, *, noise: NoisyStart, past_rows: int) -> tuple[Agents, AgentLog]:

@@ -11,6 +11,7 @@ from typing import Annotated, Any
 import numpy as np
 from jaxtyping import Float, Int
 
+from scenefactory_jax.core.scene_arrays import wrap_angles
 from scenefactory_jax.core.schema import Bounds, ConfigError, Count, NonNegative
 from scenefactory_jax.core.types import Scene
 from scenefactory_jax.data.loading.samplers import SceneOutcomes
@@ -49,8 +50,7 @@ def measure_track(place: Float[np.ndarray, "L 2"], length_m: float) -> float:
     travelled = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(place, axis=0).T))])
     at = np.arange(0.0, travelled[-1], SPACING_M)
     steps = np.diff(np.stack([np.interp(at, travelled, column) for column in place.T], axis=1), axis=0)
-    turns = np.diff(np.arctan2(steps[:, 1], steps[:, 0]))
-    turns = np.abs((turns + np.pi) % (2 * np.pi) - np.pi)
+    turns = np.abs(wrap_angles(np.diff(np.arctan2(steps[:, 1], steps[:, 0]))))
     return float(travelled[-1] * (1.0 + turns.sum() / np.pi))
 
 
