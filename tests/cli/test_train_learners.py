@@ -90,7 +90,7 @@ def test_one_word_trains_gail(tmp_path):
 
 
 def test_one_word_makes_copo(tmp_path):
-    """The learner asks the policy for three values, of which no evaluation reads one. Traced, not compiled: PPO's test trains."""
+    """The learner asks the policy for three values, of which no evaluation reads one. It is traced, not compiled."""
     config = smoke(tmp_path / "run", "learner=copo")
     parts = training_loop.prepare(config)
     stage, _ = scene_source.assign_scenes(scene_source.load_training_scenes(config["scenes"]), 4, seed=0, mesh=None)
