@@ -103,7 +103,7 @@ def test_an_encoder_is_shared_only_on_demand(shared):
 
 
 def test_a_critic_has_as_many_values_as_its_learner():
-    policy = actor_critic.make(encoder={"_target_": "lq", **ENTRIES["lq"]}, **POLICY, values=3)
+    policy = actor_critic.make(encoder={"_target_": "none"}, **POLICY, values=3)
     drawn = jax.eval_shape(policy.init, jax.random.key(0), OBSERVATION)
     mean, log_std, value = jax.eval_shape(policy.apply, drawn, OBSERVATION)
     assert (mean.shape, log_std.shape, value.shape) == ((2, 3, 3), (3,), (2, 3, 3))
