@@ -115,9 +115,7 @@ def compute_batch(ppo: PPO, samples: rollout.Sample, last_value: Float[Array, "W
     return make_batch(ppo, samples, advantage, returns)
 
 
-def make_batch(
-    ppo: PPO, samples: rollout.Sample, advantage: Float[Array, "T W A"], returns: Float[Array, "T W A *values"]
-) -> loss.Batch:
+def make_batch(ppo: PPO, samples: rollout.Sample, advantage: Float[Array, "T W A"], returns: Float[Array, "T W A *values"]) -> loss.Batch:
     """Makes a flat batch of samples [T, W, A] with their advantages; groups of worlds follow one another.
 
     Samples of inactive agents and of agents that the time limit stopped carry no weight.
