@@ -247,6 +247,7 @@ def _collect_scenarionet(record: EpisodeRecord, steps: StepMetrics, *, max_later
         "route_completion": (completion, has_track),
         "route_success": (completion > scenarionet_steps.SUCCESS_COMPLETION, has_track),
         "out_of_road": (jnp.any(outside), has_track),
+        "crashes": (jnp.sum(jnp.any(steps.touching & counted[:, None], axis=0)), True),
         "cost": (jnp.asarray(cost), True),
     }
 
