@@ -153,7 +153,8 @@ class Session:
     def make_evaluator(self, evaluation: Evaluation, kind: str) -> Evaluator:
         """Makes the evaluator of a condition and protocol."""
         settings = {**evaluation.config["evaluation"], **self.config["evaluation"]}
-        scores = evaluation.scores and read_settings(evaluation.scores, ScoreSettings, where="protocol.scores")
+        found = evaluation.scores
+        scores = None if found is None else read_settings(found, ScoreSettings, where="protocol.scores")
         scenes = self.heldout_scenes(evaluation.config)
         return self.uses.count(make_evaluator(evaluation.config, scenes, settings=settings, scores=scores), kind)
 

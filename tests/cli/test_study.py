@@ -10,7 +10,7 @@ import jax
 import pytest
 from support import study_parts
 
-from scenefactory_jax.cli import hydra_config, study_plan
+from scenefactory_jax.cli import hydra_config, schema, study_plan
 from scenefactory_jax.cli import study as command
 from scenefactory_jax.cli.study import study
 from scenefactory_jax.core import config as run_config
@@ -356,6 +356,7 @@ def steps_of(config):
     return math.prod([config["iterations"], config["worlds"], config["ppo"]["horizon"], config["actions"]["action_repeat"]])
 
 
+TIMED = {"vmax": "vmax", "scenarionet": "scenarionet", "curriculum": "scenarionet", "learners": "route100"}  # study -> its protocol
 TWINS = {"rewards_laptop", "network_laptop"}  # nearly the same variants as another study, for a CPU
 
 
@@ -364,7 +365,28 @@ def test_names_of_a_study_fit_each_other(name):
     study_plan.check(hydra_config.load_config("study", f"study={name}"))
 
 
-@pytest.mark.parametrize("name", [pytest.param(n, marks=[pytest.mark.slow] if n in TWINS else []) for n in STUDIES])
+@pytest.mark.parametrize("name", sorted(TIMED))
+def test_every_row_of_a_study_of_equal_time_builds(name, tmp_path):
+    """Every learner finds its keys and its network, all judge by the study's protocol, and each row has its time."""
+    entry = hydra_config.load_config("study", f"study={name}", f"runs={tmp_path}", "train_scenes=train.bank", "test_scenes=test.bank")
+    plan = study_plan.make(entry | {"seeds": [0]})
+    assert entry["protocol"]["name"] == TIMED[name] and {one.config["minutes"] for one in plan.trainings} == {entry_minutes(entry)}
+    for one in {one.program: one for one in plan.trainings}.values():
+        schema.check_train(one.config)
+        training_loop.prepare(one.config)
+    for one in {one.program: one for one in plan.evaluations}.values():
+        environment.make_parts(one.config)
+        assert (one.scores is None) == (name == "learners")
+    kinds = {one.program: one.config["learner"].get("actor") for one in plan.evaluations if one.weights == study_plan.TRAINED}
+    assert all(one.config["learner"].get("actor") == kinds.get(one.program, None) for one in plan.evaluations if one.program in kinds)
+    assert not set(entry["study"]["planners"]) - {one.row for one in plan.evaluations}
+
+
+def entry_minutes(entry):
+    return next(float(word.partition("=")[2]) for word in entry["study"]["common"] if word.startswith("minutes="))
+
+
+@pytest.mark.parametrize("name", [pytest.param(n, marks=[pytest.mark.slow] if n in TWINS else []) for n in STUDIES if n not in TIMED])
 def test_every_study_is_whole(name, tmp_path):
     """Every training and evaluation builds, and what is compared or drawn is evaluated."""
     entry = hydra_config.load_config("study", f"study={name}", f"runs={tmp_path}", "train_scenes=train.bank", "seeds=[0]")
