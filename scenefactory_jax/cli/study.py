@@ -250,7 +250,7 @@ def _make_evaluation(session: Session, first: Evaluation) -> Callable[[Evaluatio
         metadata = {"protocol": evaluation.protocol, "policy": evaluation.row, "condition": evaluation.condition}
         metadata |= {"config_digest": evaluation.program, "versions": run_config.versions()}
         write_records(evaluation.file, records, metadata=metadata)
-        shown = [name for name in session.config["study"]["metrics"] or EVENTS_SHOWN if name in records]
+        shown = [name for name in session.config["study"]["metrics"] or EVENTS_SHOWN if name in records and np.isfinite(records[name]).any()]
         rates = ", ".join(f"{name} {np.nanmean(records[name]):.3f}" for name in shown)
         print(f"{evaluation.label}: {rates}", flush=True)
 

@@ -23,7 +23,7 @@ DIGITS = 5
 AGENTS = "agents"  # folder of the tables of agents
 RowKey = tuple[str, str, str]  # row, condition, protocol
 RowRecords = dict[RowKey, dict[int, dict[str, np.ndarray]]]  # -> seed of training -> records
-REDRAWN = ("question", "figures", "trend")  # keys of a study that decide no number
+REDRAWN = ("question", "figures", "trend", "metrics")  # keys of a study that decide no number
 
 
 def find_folder(config: Mapping[str, Any]) -> Path:
