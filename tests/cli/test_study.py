@@ -198,7 +198,7 @@ def test_a_study_has_columns_of_its_own(done, tmp_path):
     study(toy(tmp_path, "parts=draw", metrics=["mean_remaining_m", "road_edge_rate", "nuplan_score"]))
     text = (tmp_path / "out" / "navigation.md").read_text()
     assert "|  | Condition | n | Remaining distance | Road-edge rate |" in text and "DRAC" not in text.split("## How to repeat")[0]
-    assert "remaining distance" in text.split("![")[0] and "nuPlan score" not in text.split("## Each seed")[0]
+    assert "Remaining distance" in text.split("![")[0] and "nuPlan score" not in text.split("## Each seed")[0]
     names = [f"metrics-{name}-strict.png" for name in ("dry", "at-random")] + ["differences-strict.png"]
     assert all(f"({name})" in text and (tmp_path / "out" / name).stat().st_size > 5000 for name in names)
     with pytest.raises(ConfigError, match=r"study\.metrics.*expected names of success_rate, .*got 'beauty'"):

@@ -91,7 +91,7 @@ def draw_figure(summary: Mapping[str, Summary]) -> Figure:
 @matplotlib.rc_context(plots.STYLE)
 def draw_panels(labels: Sequence[str], summaries: Sequence[Summary], metrics: Sequence[str]) -> Figure:
     """Draws bars with 95 % intervals: a panel a metric, a bar a summary; "absent" where there is no value."""
-    figure = Figure(figsize=(1.0 + 1.6 * len(metrics), 0.34 * len(labels) + 1.0), layout="constrained")
+    figure = Figure(figsize=(1.0 + 1.9 * len(metrics), 0.34 * len(labels) + 1.0), layout="constrained")
     panels = figure.subplots(1, len(metrics), sharey=True, squeeze=False)[0]
     for axes, name in zip(panels, metrics, strict=True):
         _draw_panel(axes, name, [summary.get(name) for summary in summaries])

@@ -36,7 +36,7 @@ def list_headline(study: Mapping[str, Any]) -> Sequence[str]:
 def draw_all(result: Result) -> Figures:
     """Draws the figures that the study's config lists and has the numbers of."""
     figures: Figures = {}
-    label = (result["study"]["trend"] or {}).get("label")
+    label, points = (result["study"]["trend"] or {}).get("label"), "" if result["study"].get("metrics") else ", percentage points"
     for kind in result["study"]["figures"]:
         if kind == "learning":
             figures |= _draw_training(result)
@@ -47,7 +47,7 @@ def draw_all(result: Result) -> Figures:
         caption, draw = _MAKERS[kind]
         for protocol in result["study"]["protocols"]:
             if (figure := draw(result, protocol)) is not None:
-                figures[caption.format(protocol=protocol, label=label)] = f"{kind}-{protocol}", figure
+                figures[caption.format(protocol=protocol, label=label, points=points)] = f"{kind}-{protocol}", figure
     return figures
 
 
@@ -210,6 +210,6 @@ def _rows(result: Result, protocol: str) -> list[Mapping[str, Any]]:
 _MAKERS = {
     "rates": ("Rates with 95 % intervals ({protocol})", _draw_rates),
     "matrix": ("Variants (rows) under conditions (columns), per cent ({protocol}); intervals below", _draw_matrix),
-    "differences": ("Differences with 95 % intervals, percentage points ({protocol})", _draw_differences),
+    "differences": ("Differences with 95 % intervals{points} ({protocol})", _draw_differences),
     "trend": ("Rates against {label}, with 95 % intervals ({protocol})", _draw_trend),
 }

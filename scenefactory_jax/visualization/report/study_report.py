@@ -20,8 +20,9 @@ SAFETY = ("mean_max_drac", "high_drac_rate", "mean_min_ttc_s", "min_ttc_s", "nea
 CHANGES = ("success_rate", "clean_success_rate", "collision_rate", "road_edge_rate", "crash_rate", "mean_max_drac")
 GROUPS = {"spawning": "Starts", "weather": "Weather", "traffic": "Background traffic", "dynamics": "Dynamics"}  # of an episode
 AS_TRAINED = "as trained"
-LABELS = {name: metric.label.lower() for name, metric in METRICS.items()}
+LABELS = {name: metric.label for name, metric in METRICS.items()}
 LABELS |= {"success_rate": "success", "clean_success_rate": "without any other event", "collision_rate": "collisions"}
+HOLM = f"\\*: below {LEVEL:g} after Holm's correction for all comparisons of the same metric, condition and protocol."
 INTERPRETATION = "interpretation.md"  # of the result; written by a person
 
 
@@ -111,10 +112,11 @@ def _differences(changes: Sequence[Mapping[str, Any]], metrics: Sequence[str]) -
         return []
     cells = [([entry[key] for key in ("before", "after", "condition", "protocol")], read_estimates(entry["change"])) for entry in changes]
     intervals, without_zero = count_intervals(changes, metrics)
+    has_p = any(entry["change"].get(name, {}).get("p") is not None for entry in changes for name in metrics)
     text = (
         "The second less the first, on the same scenes, cars and seeds. If all true differences were zero, about one 95 % interval in "
         f"twenty would still exclude zero: {intervals / 20:.1f} of the {intervals} in this table. {without_zero} of them do. "
-        f"\\*: below {LEVEL:g} after Holm's correction for all comparisons of the same metric, condition and protocol."
+        + (HOLM if has_p else "No correction for multiple comparisons is applied.")
     )
     findings = find_findings(changes, metrics)
     return [text, tables.format_rows(["From", "To", "Condition", "Protocol"], cells, metrics, signed=True, findings=findings)]
