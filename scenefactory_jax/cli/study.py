@@ -229,6 +229,7 @@ def _train(training: Training, prepared: training_loop.Prepared, evaluators: Map
     callback = functools.partial(make_training_callback, config, evaluators=evaluators)
     last = training_loop.train(config, prepared=prepared, make_callback=callback).metrics[-1]
     note = {"digest": training.digest, "seed": training.seed, "iterations": int(last["iteration"]), "steps": last["steps/total"]}
+    note |= {"hours": last["steps/total"] / float(config["timing"]["control_hz"]) / 3600}  # that agents drove
     note |= {"minutes": last["minutes"], "commit": run_config.find_commit(), "versions": run_config.versions()}
     if prepared.scenes is not None:
         scenes = scene_source.take_scenes(prepared.scenes, config["scenes"])

@@ -169,15 +169,16 @@ def _trainings(result: Result) -> list[str]:
     for variant, trained in result["trainings"].items():
         for seed, run in trained["runs"].items():
             scenes = "" if run["scenes"] is None else f"{run['scenes']} ({run['agents']} agents)"
-            duration = _steps(run["steps"]), f"{run['minutes']:.1f}", f"{run['casps']:,.0f}"
+            driven = "" if run.get("hours") is None else f"{run['hours']:,.1f}"
+            duration = _steps(run["steps"]), driven, f"{run['minutes']:.1f}", f"{run['casps']:,.0f}"
             cells.append([variant, seed, scenes, run["iterations"], *duration, run["device"], f"`{run['commit']}`"])
     if not cells:
         return []
-    header = ["", "Seed", "Scenes", "Iterations", "Agent steps", "Minutes", "Steps/s", "Device", "Commit"]
+    header = ["", "Seed", "Scenes", "Iterations", "Agent steps", "Hours driven", "Minutes", "Steps/s", "Device", "Commit"]
     total = sum(run["minutes"] for trained in result["trainings"].values() for run in trained["runs"].values())
     text = (
         f"{total:.0f} minutes of training in all. Minutes are those of iterations; the first run of a program compiles it in its first "
-        "iteration. Agent steps are control steps of spawned slots; of the steps a second, the median over iterations."
+        "iteration. Agent steps are control steps of spawned slots, hours those that they drove; of the steps a second, the median."
     )
     return [text, markdown.format_table(header, cells), _to_target(result)]
 
