@@ -251,7 +251,8 @@ def _make_evaluation(session: Session, first: Evaluation) -> Callable[[Evaluatio
         metadata = {"protocol": evaluation.protocol, "policy": evaluation.row, "condition": evaluation.condition}
         metadata |= {"config_digest": evaluation.program, "versions": run_config.versions()}
         write_records(evaluation.file, records, metadata=metadata)
-        shown = [name for name in session.config["study"]["metrics"] or EVENTS_SHOWN if name in records and np.isfinite(records[name]).any()]
+        known = [name for name, column in records.items() if column.dtype.kind in "bf" and np.isfinite(column).any()]
+        shown = [name for name in session.config["study"]["metrics"] or EVENTS_SHOWN if name in known]
         rates = ", ".join(f"{name} {np.nanmean(records[name]):.3f}" for name in shown)
         print(f"{evaluation.label}: {rates}", flush=True)
 

@@ -418,7 +418,7 @@ def test_every_row_of_a_study_of_equal_time_builds(name, tmp_path):
         environment.make_parts(one.config)
         assert (one.scores is None) == (name == "learners")
     kinds = {one.program: one.config["learner"].get("actor") for one in plan.evaluations if one.weights == study_plan.TRAINED}
-    assert all(one.config["learner"].get("actor") == kinds.get(one.program, None) for one in plan.evaluations if one.program in kinds)
+    assert all(one.config["learner"].get("actor") == kinds.get(one.program) for one in plan.evaluations if one.program in kinds)
     assert not set(entry["study"]["planners"]) - {one.row for one in plan.evaluations}
 
 
