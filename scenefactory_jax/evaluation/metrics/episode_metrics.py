@@ -235,8 +235,8 @@ def _collect_safety(record: EpisodeRecord, steps: StepMetrics) -> Pairs:
 
 
 def _collect_scenarionet(record: EpisodeRecord, steps: StepMetrics, *, max_lateral_m: float) -> Pairs:
-    """MetaDrive's: completion of the recorded track where its episode ends, by arrival, out of road or by time, and contacts until then; cost:
-    all counted states out of road or in contact, each kind for itself."""
+    """MetaDrive's: completion of the recorded track where its episode ends (by arrival, out of road or by time), and contacts until then.
+    Cost: all counted states out of road or in contact, each kind for itself."""
     counted, kind = record.counted, record.others.kind
     length = scenarionet_steps.measure_track(record.log.position[:, :2], record.log.valid)
     has_track = length >= scenarionet_steps.SHORT_TRACK_M
