@@ -17,7 +17,7 @@ LAYERS = (  # a package imports from itself and from layers before its own; pack
 SCRIPT = PACKAGE / "dynamics/mujoco_car.py"  # `view out=world.xml` copies it beside the world
 AT_THE_ROOT = {"__init__.py", "__main__.py"}
 ON_DEVICE = ("roadgraph/queries.py", "roadgraph/spatial_grid.py", "roadgraph/road_kernels.py", "weather", "dynamics", "env")
-ON_DEVICE += tuple(f"learning/{part}" for part in ("ppo", "sac", "td3", "bc", "adversarial", "off_policy.py", "rollout.py"))
+ON_DEVICE += tuple(f"learning/{part}" for part in ("ppo", "sac", "td3", "bc", "adversarial", "copo", "off_policy.py", "rollout.py"))
 HOST_ONLY = {"os", "pathlib", "time", "logging", "matplotlib", "shutil", "datetime"}
 
 

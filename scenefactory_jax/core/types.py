@@ -352,7 +352,7 @@ class Env(NamedTuple):
 
 
 class Policy(NamedTuple):
-    """`apply(parameters, observation) -> (mean [..., 3], log_std [3], value [...])` for any leading axes.
+    """`apply(parameters, observation) -> (mean [..., 3], log_std [3], value [...])` for any leading axes; several values: [..., values].
 
     A deviation may depend on the observation: log_std [..., 3]. A logarithm of -inf is that of a policy without noise, as a planner.
     """

@@ -47,11 +47,12 @@ class Sample:
     action: Float[Array, "W A 3"]  # before the environment's clipping
     mean: Float[Array, "W A 3"]
     log_probability: Float[Array, "W A"]
-    value: Float[Array, "W A"]
+    value: Float[Array, "W A *values"]
     reward: Float[Array, "W A"]  # sum over the control steps
     active: Bool[Array, "W A"]  # before the action
     terminated: Bool[Array, "W A"]  # by an event
     truncated: Bool[Array, "W A"]  # active when the world reached the time limit
+    position: Float[Array, "W A 2"]  # before the action
 
 
 @pytree_dataclass
@@ -98,10 +99,10 @@ def collect_rollout(
         action_key, start_key = jax.random.split(key)
         mean, log_std, value = policy.apply(parameters, worlds.observation)
         action = mean + jnp.exp(log_std) * sample_noise(action_key, mean, axis)
-        observation = worlds.observation
+        observation, position = worlds.observation, worlds.state.motion.position[..., :2]
         worlds, outcome, counts = step_worlds(env, scenes, worlds, action, start_key, axis=axis)
         density = log_probability(action, mean, log_std)
-        return worlds, (Sample(observation, action, mean, density, value, **vars(outcome)), counts)
+        return worlds, (Sample(observation, action, mean, density, value, **vars(outcome), position=position), counts)
 
     worlds, (samples, counts) = jax.lax.scan(step, worlds, jax.random.split(key, horizon))
     return worlds, samples, jax.tree.map(jnp.sum, counts), count_episodes(counts)

@@ -44,7 +44,7 @@ class TrainState:
     iteration: Int[Array, ""]
     steps: Int[Array, " 2"]  # steps of spawned slots so far: millions and the rest, since int32 ends at 2.1 billion
     learner: Any = ()  # what else the algorithm learns, on every device: critics, target networks
-    buffer: Any = ()  # past samples, with groups of worlds along the first axis, which is divided over the devices
+    buffer: Any = ()  # past samples or numbers of agents, with worlds or groups of them along the first axis, which the devices divide
 
 
 class Trainer(NamedTuple):

@@ -126,13 +126,13 @@ def _open_scenes(
 def make_policy(config: Mapping[str, Any]) -> Policy:
     """Builds the policy of a config's `policy` entry.
 
-    Planners are given the run's `dynamics`, encoders its `observations`, and networks the kind of actor that its `learner` trains and how
-    many numbers of an action its `actions` read.
+    Planners are given the run's `dynamics`, encoders its `observations`, and networks the kind of actor and the number of values
+    that its `learner` trains, and how many numbers of an action its `actions` read.
     """
     names = {"dynamics": "dynamics", "observations": "observation_groups"}  # planners have numbers that are called observations
     context = {names[key]: config[key] for key in names if key in config}
     learner, actions = config.get("learner", {}), config.get("actions", {})
-    context |= {name: part[name] for name, part in (("actor", learner), ("numbers", actions)) if name in part}
+    context |= {name: part[name] for name, part in (("actor", learner), ("values", learner), ("numbers", actions)) if name in part}
     return instantiate(config["policy"], builtins=late_fusion, where="policy", **context)()
 
 

@@ -89,6 +89,19 @@ def test_one_word_trains_gail(tmp_path):
     jax.tree.map(np.testing.assert_array_equal, trained.parameters, get_policy_parameters(run.state))
 
 
+def test_one_word_makes_copo(tmp_path):
+    """The learner asks the policy for three values, of which no evaluation reads one. It is traced, not compiled."""
+    config = smoke(tmp_path / "run", "learner=copo")
+    parts = training_loop.prepare(config)
+    stage, _ = scene_source.assign_scenes(scene_source.load_training_scenes(config["scenes"]), 4, seed=0, mesh=None)
+    state = jax.eval_shape(parts.trainer.init, jax.random.key(0), stage)
+    after, metrics = jax.eval_shape(parts.trainer.train_iteration, state, stage)
+    assert jax.tree.structure(after) == jax.tree.structure(state) and after.buffer["copo"].shape == (4, 4)
+    assert {"copo/lcf_mean", "copo/lcf_std", "ppo/explained_variance", "copo/explained_variance_global"} <= metrics.keys()
+    mean, _, value = jax.eval_shape(parts.policy.apply, state.parameters, state.worlds.observation)
+    assert mean.shape == value.shape == (4, 4, 3)
+
+
 @pytest.mark.parametrize(
     "change, message",
     [

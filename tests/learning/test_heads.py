@@ -102,6 +102,13 @@ def test_an_encoder_is_shared_only_on_demand(shared):
     assert touched == {0: {names[0], "actor_head"}, 2: {names[1], "critic_head"}}
 
 
+def test_a_critic_has_as_many_values_as_its_learner():
+    policy = actor_critic.make(encoder={"_target_": "none"}, **POLICY, values=3)
+    drawn = jax.eval_shape(policy.init, jax.random.key(0), OBSERVATION)
+    mean, log_std, value = jax.eval_shape(policy.apply, drawn, OBSERVATION)
+    assert (mean.shape, log_std.shape, value.shape) == ((2, 3, 3), (3,), (2, 3, 3))
+
+
 def test_critics_lower_to_the_kernels_of_sets_on_a_gpu():
     encoder = encoding.make_encoder("late_fusion", rows=[32, 64])
     network = heads.make_critic(encoder, 2, **HEAD)

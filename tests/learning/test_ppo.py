@@ -139,7 +139,7 @@ def test_empty_slots_and_truncated_samples_have_no_weight():
     observation, pair = {"cue": none[..., None]}, jnp.zeros((T, W, A, 3))
     samples = unchecked(  # with the axis of time before that of worlds
         rollout.Sample, observation=observation, action=pair, mean=pair, log_probability=none, value=none, reward=none, active=active,
-        terminated=jnp.zeros((T, W, A), bool), truncated=truncated,
+        terminated=jnp.zeros((T, W, A), bool), truncated=truncated, position=pair[..., :2],
     )  # fmt: skip
     ppo = PPO(probe(), late_fusion.make(**SMALL), ppo_config())
     batch = jax.jit(lambda samples: train_iteration.compute_batch(ppo, samples, samples.value[0]))(samples)

@@ -95,6 +95,16 @@ def test_adversarial_imitation_learns_the_same_on_two_devices():
     assert one["metrics"] == pytest.approx(both["metrics"], rel=1e-3, abs=1e-4)
 
 
+@pytest.mark.slow  # most parts are those of PPO
+def test_coordinated_policies_learn_the_same_on_two_devices():
+    """Agents' factors are divided as the worlds are; their distribution moves by sums over the devices."""
+    one, both = result(start("copo", visible=2, module="support.coordination"))
+    assert both["same"] and (one["parts"], both["parts"]) == (1, 2)
+    for name in ("parameters", "factors"):
+        np.testing.assert_allclose(one[name], both[name], atol=2e-5)
+    assert one["metrics"] == pytest.approx(both["metrics"], rel=1e-3, abs=1e-4)
+
+
 def test_mistakes_are_named():
     with pytest.raises(ConfigError, match=r"ppo\.shards: expected a multiple of 1 devices, got 0"):
         make_trainer(probe(), shards=0)

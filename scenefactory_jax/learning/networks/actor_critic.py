@@ -25,6 +25,7 @@ def make(
     observation_groups: dict[str, Any],
     actor: squashed.Actor = "gaussian",
     numbers: int = squashed.FULL,
+    values: Count = 1,
 ) -> Policy:
     """Builds the policy of PPO, or a squashed actor and critics.
 
@@ -36,6 +37,7 @@ def make(
         dtype: of products; the first layers of encoders, the last ones of heads, sums, parameters, means and values are float32.
         observation_groups: the config's `observations`.
         actor, numbers: of the learner, and of an action; supplied. A squashed actor and its critics share no encoder.
+        values: of the critic, as the learner has them; supplied.
 
     Raises:
         ConfigError: a number that does not fit; at `init`, an observation that the encoder cannot read.
@@ -47,7 +49,7 @@ def make(
     if actor != "gaussian":
         head = {"hidden": hidden, "activation": activation, "dtype": dtype, "activate_last": False}
         return squashed.make(bound, actor=actor, numbers=numbers, **head, **first)
-    network = ActorCritic(bound, tuple(hidden), activation, shared_encoder, **first, dtype=dtype)
+    network = ActorCritic(bound, tuple(hidden), activation, shared_encoder, **first, dtype=dtype, values=values)
     return Policy(network.init, network.apply, encoder=bound)  # pyright: ignore[reportArgumentType]
 
 
@@ -62,13 +64,14 @@ class ActorCritic(nn.Module):
     log_std_init: float
     actor_head_scale: float
     dtype: str
+    values: int
 
     @nn.compact
-    def __call__(self, observation: Observation) -> tuple[Float[Array, "*batch 3"], Float[Array, " 3"], Float[Array, "*batch"]]:
+    def __call__(self, observation: Observation) -> tuple[Float[Array, "*batch 3"], Float[Array, " 3"], Float[Array, "*batch_values"]]:
         actor = self.encoder(name="encoder" if self.shared_encoder else "actor_encoder")(observation)
         critic = actor if self.shared_encoder else self.encoder(name="critic_encoder")(observation)
         first = nn.initializers.orthogonal(self.actor_head_scale), lambda *_: jnp.array(self.mean_init, jnp.float32)
         mean = Head(self.hidden, len(self.mean_init), self.activation, self.dtype, *first, name="actor_head")(actor)
-        value = Head(self.hidden, 1, self.activation, self.dtype, lecun_uniform, name="critic_head")(critic)
+        value = Head(self.hidden, self.values, self.activation, self.dtype, lecun_uniform, name="critic_head")(critic)
         log_std = self.param("log_std", nn.initializers.constant(self.log_std_init), (len(self.mean_init),), jnp.float32)
-        return mean, log_std, value[..., 0]
+        return mean, log_std, value[..., 0] if self.values == 1 else value

@@ -5,14 +5,16 @@ embedding: bfloat16 has 0.3 m for a place at 70 m.
 """
 
 import dataclasses
-from typing import Any, Literal
+from typing import Any
 
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
+from scenefactory_jax.core import pallas
 from scenefactory_jax.core.schema import ConfigError, Count
+from scenefactory_jax.learning.networks import attention_kernel
 from scenefactory_jax.learning.networks.heads import lecun_uniform
 from scenefactory_jax.learning.networks.late_fusion import pool
 from scenefactory_jax.learning.networks.observation_blocks import Blocks
@@ -30,7 +32,7 @@ class Transformer:
     heads: Count
     head_features: Count
     feed_forward: Count  # hidden width of a feed-forward part, in widths of its input
-    implementation: Literal["xla", "cudnn"]  # of jax.nn.dot_product_attention
+    kernels: bool  # Triton kernels on NVIDIA GPUs, where they fit
 
     def __post_init__(self) -> None:
         if not self.embedding:
@@ -117,15 +119,51 @@ class Attention(nn.Module):
         self, x: Float[Array, "B T D"], keys_values: tuple[Array, Array], mask: Bool[Array, "B #T S"] | None = None
     ) -> Float[Array, "B T D"]:
         keys, values = keys_values
-        heads = None if mask is None else mask[:, None]
         queries = self._split(self.query(x))
-        found = jax.nn.dot_product_attention(queries, keys, values, mask=heads, implementation=self.numbers.implementation)
-        if mask is not None:
-            found = jnp.where(jnp.any(mask, axis=-1)[..., None, None], found, 0)
+        mask = jnp.ones((*keys.shape[:1], 1, keys.shape[1]), bool) if mask is None else mask
+        if self.numbers.kernels and mask.shape[1] == 1 and attention_kernel.fits(queries):
+            found = attend(queries, keys, values, mask[:, 0])
+        else:
+            found = attend_plainly(queries, keys, values, mask)
         return self.out(found.reshape(*x.shape[:-1], -1)).astype(jnp.float32)
 
     def _split(self, x: Float[Array, "B T C"]) -> Float[Array, "B T H E"]:
         return x.reshape(*x.shape[:-1], self.numbers.heads, self.numbers.head_features)
+
+
+def attend_plainly(
+    queries: Float[Array, "B T H E"], keys: Float[Array, "B S H E"], values: Float[Array, "B S H E"], mask: Bool[Array, "B #T S"]
+) -> Float[Array, "B T H E"]:
+    """Computes the attention in plain JAX, zeros for a query without a valid key."""
+    found = jax.nn.dot_product_attention(queries, keys, values, mask=mask[:, None])
+    return jnp.where(jnp.any(mask, axis=-1)[..., None, None], found, 0)
+
+
+@jax.custom_vjp
+def attend(
+    queries: Float[Array, "B T H E"], keys: Float[Array, "B S H E"], values: Float[Array, "B S H E"], mask: Bool[Array, "B S"]
+) -> Float[Array, "B T H E"]:
+    """Computes the same, by a kernel on NVIDIA GPUs; all queries of a sample have one mask. Forward-mode differentiation is not defined."""
+    return _attend_forward(queries, keys, values, mask)[0]
+
+
+def _attend_forward(queries: Array, keys: Array, values: Array, mask: Array) -> tuple[Array, tuple]:
+    def plain(queries: Array, keys: Array, values: Array, mask: Array) -> tuple[Array, Array]:
+        batch, count, heads, _ = queries.shape
+        return attend_plainly(queries, keys, values, mask[:, None]), jnp.zeros((batch, heads, count), jnp.float32)
+
+    found, total = pallas.on_gpu(attention_kernel.attend, plain, queries, keys, values, mask)
+    return found, (queries, keys, values, mask, found, total)
+
+
+def _attend_backward(residuals: tuple, cotangent: Array) -> tuple[Array, Array, Array, None]:
+    def plain(queries: Array, keys: Array, values: Array, mask: Array, found: Array, total: Array, cotangent: Array) -> tuple:
+        return jax.vjp(lambda q, k, v: attend_plainly(q, k, v, mask[:, None]), queries, keys, values)[1](cotangent)
+
+    return (*pallas.on_gpu(attention_kernel.gradient, plain, *residuals, cotangent), None)
+
+
+attend.defvjp(_attend_forward, _attend_backward)
 
 
 class FeedForward(nn.Module):

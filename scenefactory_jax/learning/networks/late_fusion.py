@@ -57,6 +57,7 @@ def make(
     kernels: bool,
     actor: squashed.Actor = "gaussian",
     numbers: int = squashed.FULL,
+    values: Count = 1,
 ) -> Policy:
     """Builds two late-fusion towers and a state-independent log standard deviation, or a squashed actor and critics.
 
@@ -74,6 +75,7 @@ def make(
         kernels: Triton kernels for sets where there is an NVIDIA GPU; False: plain JAX.
         actor, numbers: of the learner, and of an action; supplied. A squashed actor: `squashed.make` on the encoders, with the trunk as
             head, whose means and deviations before the tanh begin as above.
+        values: of the critic, as the learner has them; supplied.
 
     Raises:
         ConfigError: at `init`, an observation without groups or with one for planners, or widths for a set that it does not have.
@@ -89,7 +91,7 @@ def make(
     first = {"mean_init": tuple(map(float, mean_init)), "log_std_init": float(log_std_init), "actor_head_scale": float(actor_head_scale)}
     encoder = functools.partial(Fusion, architecture)
     if actor == "gaussian":
-        network = ActorCritic(architecture, **first)
+        network = ActorCritic(architecture, **first, values=values)
         policy = Policy(network.init, network.apply, encoder=encoder)  # pyright: ignore[reportArgumentType]
     else:
         head = {"hidden": trunk, "activation": activation, "dtype": dtype, "activate_last": True}
@@ -112,13 +114,14 @@ class ActorCritic(nn.Module):
     mean_init: tuple[float, ...]
     log_std_init: float
     actor_head_scale: float
+    values: int
 
     @nn.compact
-    def __call__(self, observation: Observation) -> tuple[Float[Array, "*batch 3"], Float[Array, " 3"], Float[Array, "*batch"]]:
+    def __call__(self, observation: Observation) -> tuple[Float[Array, "*batch 3"], Float[Array, " 3"], Float[Array, "*batch_values"]]:
         mean = Tower(self.architecture, head_bias=self.mean_init, head_scale=self.actor_head_scale, name="actor")(observation)
-        value = Tower(self.architecture, head_bias=(0.0,), head_scale=1.0, name="critic")(observation)
+        value = Tower(self.architecture, head_bias=(0.0,) * self.values, head_scale=1.0, name="critic")(observation)
         log_std = self.param("log_std", nn.initializers.constant(self.log_std_init), (len(self.mean_init),), jnp.float32)
-        return mean, log_std, value[..., 0]
+        return mean, log_std, value[..., 0] if self.values == 1 else value
 
 
 class Tower(nn.Module):

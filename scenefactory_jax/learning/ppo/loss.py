@@ -26,9 +26,9 @@ class Batch:
     action: Float[Array, "N 3"]
     mean: Float[Array, "N 3"]
     log_probability: Float[Array, " N"]
-    value: Float[Array, " N"]
+    value: Float[Array, "N *values"]
     advantage: Float[Array, " N"]
-    returns: Float[Array, " N"]
+    returns: Float[Array, "N *values"]
     weight: Float[Array, " N"]
 
 
@@ -36,6 +36,8 @@ def compute_loss(
     parameters: Any, batch: Batch, log_std_old: Float[Array, " 3"], *, policy: Policy, config: PPOConfig, axis: str | None = None
 ) -> tuple[Float[Array, ""], dict[str, Float[Array, ""]]]:
     """Computes clipped surrogate + value loss - entropy bonus, and metrics; on several devices, each device's summand of them.
+
+    The loss of several values is the sum of theirs.
 
     Args:
         log_std_old: of the policy that acted.
@@ -46,16 +48,18 @@ def compute_loss(
     average = functools.partial(partial_mean, weight=weight, total=sharding.sum_over_devices(jnp.sum(weight), axis))
     # the contents of an empty slot must not reach a gradient, not even as 0 x inf
     change = gaussian.log_probability(batch.action, mean, log_std) - batch.log_probability
-    change, advantage, old, target = (jnp.where(weight > 0.0, x, 0.0) for x in (change, batch.advantage, batch.value, batch.returns))
+    change, advantage = (jnp.where(weight > 0.0, x, 0.0) for x in (change, batch.advantage))
+    has_weight = weight > 0.0 if value.ndim == 1 else weight[:, None] > 0.0
+    old, target = (jnp.where(has_weight, x, 0.0) for x in (batch.value, batch.returns))
 
     ratio = jnp.exp(change)
-    policy_loss = -average(jnp.minimum(ratio * advantage, jnp.clip(ratio, 1.0 - clip_eps, 1.0 + clip_eps) * advantage))
+    policy_loss = -average(clip_surrogate(ratio, advantage, clip_eps))
 
     errors = (value - target) ** 2
     if value_clip is not None:
         clipped = old + jnp.clip(value - old, -value_clip, value_clip)
         errors = jnp.maximum(errors, (clipped - target) ** 2)
-    value_loss = average(errors)
+    value_loss = average(errors if errors.ndim == 1 else jnp.sum(errors, axis=-1))
 
     entropy = average(jnp.broadcast_to(gaussian.entropy(log_std), weight.shape))
     total = policy_loss + config.vf_coef * value_loss - config.ent_coef * entropy
@@ -67,6 +71,11 @@ def compute_loss(
         "clip_fraction": average((jnp.abs(ratio - 1.0) > clip_eps).astype(jnp.float32)),
     }
     return total, jax.lax.stop_gradient(metrics)
+
+
+def clip_surrogate(ratio: Float[Array, "*batch"], advantage: Float[Array, "*batch"], clip_eps: float) -> Float[Array, "*batch"]:
+    """Computes what a probability ratio gains, which has a bound where the ratio has left [1 - clip_eps, 1 + clip_eps]."""
+    return jnp.minimum(ratio * advantage, jnp.clip(ratio, 1.0 - clip_eps, 1.0 + clip_eps) * advantage)
 
 
 def normalize_advantages(x: Float[Array, "*batch"], weight: Float[Array, "*batch"], *, axis: str | None = None) -> Float[Array, "*batch"]:

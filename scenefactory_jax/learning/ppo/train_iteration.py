@@ -70,14 +70,21 @@ def collect(ppo: PPO, train_state: TrainState, scenes: Scene, key: PRNGKeyArray)
 
 def learn(ppo: PPO, train_state: TrainState, collected: Collected, key: PRNGKeyArray) -> tuple[TrainState, Metrics]:
     """Learns from a rollout: advantages, epochs of minibatches, metrics."""
-    config, axis, parameters = ppo.config, ppo.axis, train_state.parameters
-    worlds, samples, counts, scene_stats = collected
-    _, log_std, last_value = ppo.policy.apply(parameters, worlds.observation)
-    batch = compute_batch(ppo, samples, last_value)
+    _, log_std, last_value = ppo.policy.apply(train_state.parameters, collected.worlds.observation)
+    batch = compute_batch(ppo, collected.samples, last_value)
+    train_state, metrics = learn_batch(ppo, train_state, collected, batch, log_std, key)
+    explained = loss.explained_variance(batch.value, batch.returns, batch.weight, axis=ppo.axis)
+    return train_state, metrics | {"ppo/explained_variance": explained}
+
+
+def learn_batch(
+    ppo: PPO, train_state: TrainState, collected: Collected, batch: loss.Batch, log_std: Float[Array, " 3"], key: PRNGKeyArray
+) -> tuple[TrainState, Metrics]:
+    """Learns from a rollout whose advantages are known: epochs of minibatches, metrics; `log_std`: of the policy that acted."""
+    config, axis = ppo.config, ppo.axis
+    worlds, _, counts, scene_stats = collected
     size = minibatch_size(config, worlds.state.active.shape, groups=ppo.groups)
     parameters, optimizer, metrics = update_epochs(ppo, train_state, batch, log_std, key, size=size)
-
-    metrics["explained_variance"] = loss.explained_variance(batch.value, batch.returns, batch.weight, axis=axis)
     counts = sharding.sum_over_devices(counts, axis)
     train_state = replace(
         train_state,
@@ -94,10 +101,7 @@ def learn(ppo: PPO, train_state: TrainState, collected: Collected, key: PRNGKeyA
 
 
 def compute_batch(ppo: PPO, samples: rollout.Sample, last_value: Float[Array, "W A"]) -> loss.Batch:
-    """Computes advantages and returns of samples [T, W, A], as one flat batch; groups of worlds follow one another.
-
-    Samples of inactive agents and of agents that the time limit stopped carry no weight.
-    """
+    """Computes advantages and returns of samples [T, W, A], as one flat batch, see `make_batch`."""
     advantage, returns = gae.compute_gae(
         samples.reward,
         samples.value,
@@ -108,6 +112,14 @@ def compute_batch(ppo: PPO, samples: rollout.Sample, last_value: Float[Array, "W
         gamma=ppo.config.gamma,
         gae_lambda=ppo.config.gae_lambda,
     )
+    return make_batch(ppo, samples, advantage, returns)
+
+
+def make_batch(ppo: PPO, samples: rollout.Sample, advantage: Float[Array, "T W A"], returns: Float[Array, "T W A *values"]) -> loss.Batch:
+    """Makes a flat batch of samples [T, W, A] with their advantages; groups of worlds follow one another.
+
+    Samples of inactive agents and of agents that the time limit stopped carry no weight.
+    """
     weight = (samples.active & ~samples.truncated).astype(jnp.float32)
     columns = samples.observation, samples.action, samples.mean, samples.log_probability, samples.value, advantage, returns, weight
     batch = loss.Batch(*jax.tree.map(functools.partial(flatten, groups=ppo.groups), columns))
