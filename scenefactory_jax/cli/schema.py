@@ -9,6 +9,7 @@ from typing import Annotated, Any, Literal
 
 from scenefactory_jax.cli.hydra_config import find_conf
 from scenefactory_jax.core.schema import Bounds, ConfigError, Count, NonNegative, Positive, Seed, check
+from scenefactory_jax.evaluation.metrics.agent_metrics import METRICS
 from scenefactory_jax.evaluation.settings import Episodes, Failures, ScoreSettings, Video
 
 Group = dict[str, Any]
@@ -263,12 +264,16 @@ class StudyPlan:
     protocols: list[str]
     evaluated: dict[str, list] | None
     baselines: dict[str, StudyBaseline]
+    planners: list[str]
     compare: list[list[str]]
+    metrics: list[str] | None
     figures: list[Literal["learning", "rates", "matrix", "differences", "trend"]]
     trend: StudyTrend | None
 
     def __post_init__(self) -> None:
         _check_seeds(self.seeds)
+        if unknown := [name for name in self.metrics or [] if name not in METRICS]:
+            raise ConfigError(f"metrics: expected names of {', '.join(METRICS)}, got {unknown[0]!r}")
         if odd := [pair for pair in self.compare if len(pair) != 2]:
             raise ConfigError(f"compare: expected pairs [before, after], got {odd[0]}")
 
@@ -279,6 +284,7 @@ class Study:
 
     train_scenes: str | None
     test_scenes: str | None
+    banks: dict[str, str]
     cut: Literal["test", "validation"]
     runs: str
     slim: bool

@@ -22,12 +22,15 @@ from scenefactory_jax.core import config as run_config
 from scenefactory_jax.core import folder_lock, result_file
 from scenefactory_jax.core.parallel import gpu_processes
 from scenefactory_jax.core.parallel.gpu_processes import TaskClaims
+from scenefactory_jax.core.schema import read as read_settings
 from scenefactory_jax.data.loading import scene_source
 from scenefactory_jax.evaluation.protocols import Evaluator, make_evaluator
 from scenefactory_jax.evaluation.records import write_records
+from scenefactory_jax.evaluation.settings import ScoreSettings
 from scenefactory_jax.learning import checkpoint, policy_io, training_loop
 
 COUNTS = ("policies", "curve points", "seconds")  # of uses of the held-out scenes
+EVENTS_SHOWN = ("goal_reached", "clean", "collision")  # columns of records, in messages of studies without `metrics`
 
 Task = TypeVar("Task", Training, Evaluation)
 
@@ -44,6 +47,7 @@ def study(config: Mapping[str, Any]) -> dict[str, Any]:
     """
     single = {name: [config[name]] for name in ("parts", "only", "seeds") if isinstance(config[name], (str, int))}
     deadline, config = time.time() + (math.inf if config["time_limit_s"] is None else config["time_limit_s"]), {**config, **single}
+    config = study_plan.add_planners(config)
     if config["parts"] == ["draw"]:
         return study_results.draw(config)
     plan = study_plan.make(config)
@@ -149,7 +153,10 @@ class Session:
     def make_evaluator(self, evaluation: Evaluation, kind: str) -> Evaluator:
         """Makes the evaluator of a condition and protocol."""
         settings = {**evaluation.config["evaluation"], **self.config["evaluation"]}
-        return self.uses.count(make_evaluator(evaluation.config, self.heldout_scenes(evaluation.config), settings=settings), kind)
+        found = evaluation.scores
+        scores = None if found is None else read_settings(found, ScoreSettings, where="protocol.scores")
+        scenes = self.heldout_scenes(evaluation.config)
+        return self.uses.count(make_evaluator(evaluation.config, scenes, settings=settings, scores=scores), kind)
 
 
 def _run(part: str, plan: Plan, session: Session) -> bool:
@@ -222,6 +229,7 @@ def _train(training: Training, prepared: training_loop.Prepared, evaluators: Map
     callback = functools.partial(make_training_callback, config, evaluators=evaluators)
     last = training_loop.train(config, prepared=prepared, make_callback=callback).metrics[-1]
     note = {"digest": training.digest, "seed": training.seed, "iterations": int(last["iteration"]), "steps": last["steps/total"]}
+    note |= {"hours": last["steps/total"] / float(config["timing"]["control_hz"]) / 3600}  # that agents drove
     note |= {"minutes": last["minutes"], "commit": run_config.find_commit(), "versions": run_config.versions()}
     if prepared.scenes is not None:
         scenes = scene_source.take_scenes(prepared.scenes, config["scenes"])
@@ -243,7 +251,9 @@ def _make_evaluation(session: Session, first: Evaluation) -> Callable[[Evaluatio
         metadata = {"protocol": evaluation.protocol, "policy": evaluation.row, "condition": evaluation.condition}
         metadata |= {"config_digest": evaluation.program, "versions": run_config.versions()}
         write_records(evaluation.file, records, metadata=metadata)
-        rates = ", ".join(f"{name} {100 * np.mean(records[name]):.1f} %" for name in ("goal_reached", "clean", "collision"))
+        known = [name for name, column in records.items() if column.dtype.kind in "bf" and np.isfinite(column).any()]
+        shown = [name for name in session.config["study"]["metrics"] or EVENTS_SHOWN if name in known]
+        rates = ", ".join(f"{name} {np.nanmean(records[name]):.3f}" for name in shown)
         print(f"{evaluation.label}: {rates}", flush=True)
 
     return run
@@ -252,7 +262,7 @@ def _make_evaluation(session: Session, first: Evaluation) -> Callable[[Evaluatio
 def _format_command(config: Mapping[str, Any]) -> str:
     """Formats the command without the paths of this machine."""
     command = run_config.format_command("study")
-    for name in ("train_scenes", "test_scenes", "runs"):
-        if config[name] is not None:
-            command = command.replace(str(config[name]), Path(config[name]).name)
+    for path in (*(config[name] for name in ("train_scenes", "test_scenes", "runs")), *config["banks"].values()):
+        if path is not None:
+            command = command.replace(str(path), Path(path).name)
     return command

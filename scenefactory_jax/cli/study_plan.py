@@ -20,6 +20,7 @@ TASK = tuple(group for group in environment.GROUPS if group != "termination")  #
 LEARNER = (*TASK, "termination", "policy", "learner", "ppo", "devices")  # groups that the compiled training depends on
 # Keys that do not change what is learnt
 IGNORED = ("name", "out", "resume", "progress", "loggers", "checkpoint_every", "checkpoints_kept", "evaluation")
+ACTOR = ("actor", "values")  # of a learner, that decide what network its policy is
 TRAINED, UNTRAINED = "checkpoints", "untrained"  # weights: a run's checkpoints, or those before training
 
 
@@ -50,6 +51,7 @@ class Evaluation(NamedTuple):
     condition: str
     protocol: str
     config: dict[str, Any]
+    scores: dict[str, Any] | None  # how episodes are scored, of the protocol; None: they are not
     program: str  # digest of all but the weights
     file: Path  # of its records
 
@@ -72,15 +74,16 @@ def make(config: Mapping[str, Any]) -> Plan:
     Raises:
         ConfigError: a key, a name or an override that does not fit, naming the variant or condition.
     """
+    config = add_planners(config)
     check(config)
     digest_files.cache_clear()  # the files may have changed since this process planned last
-    study, terminations = config["study"], load_terminations(config["study"]["protocols"])
+    study, protocols = config["study"], {name: _load_protocol(config, name) for name in config["study"]["conditions"]}
     seeds = study["seeds"] if config["seeds"] is None else config["seeds"]
     trainings = [training for variant in study["trainings"] for training in _plan_trainings(config, variant, seeds)]
     evaluations = [
         evaluation
         for training in trainings
-        for evaluation in _plan_evaluations(config, training, terminations, is_first=training.seed == seeds[0])
+        for evaluation in _plan_evaluations(config, training, protocols, is_first=training.seed == seeds[0])
     ]
     rows, conditions = [*study["trainings"], *study["baselines"]], list(study["conditions"])
     evaluations.sort(key=lambda evaluation: (conditions.index(evaluation.condition), rows.index(evaluation.row)))
@@ -136,6 +139,43 @@ def check(config: Mapping[str, Any]) -> None:
         raise ConfigError(f"study.baselines: expected names that no variant has, got {sorted(doubled)[0]!r}")
 
 
+def add_planners(config: Mapping[str, Any]) -> dict[str, Any]:
+    """Adds the study's `planners` to its baselines, with the overrides that they have in `evaluate` under its protocol."""
+    study, protocol = config["study"], config["protocol"]
+    if not study["planners"] or not study["trainings"]:
+        return dict(config)
+    known = configs.load_config("evaluate", "run=null", f"protocol={protocol['name']}")["planner_overrides"]
+    own = protocol.get("planner_overrides", {})
+    if unknown := [name for name in study["planners"] if name not in known]:
+        raise ConfigError(f"study.planners: expected names of {', '.join(known)}, got {unknown[0]!r}")
+    first = {"of": next(iter(study["trainings"])), "conditions": None, "seeds": 1}
+    planners = {name: {**first, "overrides": [*known[name], *own.get(name, [])]} for name in study["planners"]}
+    return {**config, "study": {**study, "planners": [], "baselines": {**study["baselines"], **planners}}}
+
+
+class ConditionProtocol(NamedTuple):
+    """How the episodes of a condition are judged."""
+
+    overrides: list[str]  # of every evaluation under the condition
+    scores: dict[str, Any] | None
+    terminations: dict[str, dict[str, Any]]
+
+
+def _load_protocol(config: Mapping[str, Any], condition: str) -> ConditionProtocol:
+    """Loads what a condition judges by: the protocol that it names (`protocol=vmax_noise`), or that of the study."""
+    overrides = config["study"]["conditions"][condition]
+    settings, protocol = list_evaluation_overrides(config), config["protocol"]
+    names = config["study"]["protocols"]
+    if named := [override for override in overrides if override.startswith("protocol=")]:
+        try:
+            protocol = configs.load_config("evaluate", "run=null", named[-1])["protocol"]
+        except ConfigError as error:
+            raise ConfigError(f"study.conditions.{condition}: {error}") from None
+        settings, names = configs.list_overrides(protocol["settings"]), protocol["termination"]
+    others = [override for override in overrides if override not in named]
+    return ConditionProtocol([*settings, *others], protocol.get("scores"), load_terminations(names))
+
+
 def list_evaluation_overrides(config: Mapping[str, Any]) -> list[str]:
     """Lists the overrides of every evaluation: the study's own, or those of the protocol."""
     own = config["study"]["evaluation_overrides"]
@@ -177,7 +217,7 @@ def _plan_training(settings: dict[str, Any], variant: str, overrides: list[str],
 
 
 def _plan_evaluations(
-    config: Mapping[str, Any], training: Training, terminations: Mapping[str, Mapping[str, Any]], *, is_first: bool
+    config: Mapping[str, Any], training: Training, protocols: Mapping[str, ConditionProtocol], *, is_first: bool
 ) -> Iterator[Evaluation]:
     """The evaluations of a training's policy, and of the baselines that begin with it."""
     study, variant = config["study"], training.variant
@@ -189,24 +229,26 @@ def _plan_evaluations(
             rows.append((name, UNTRAINED, chosen, list(baseline["overrides"])))
     for row, weights, chosen, overrides in rows:
         for condition in chosen:
+            judged = protocols[condition]
             try:
-                merged = [*list_evaluation_overrides(config), *study["conditions"][condition], *overrides]
-                settings = configs.apply_overrides(training.config, merged)
+                settings = configs.apply_overrides(training.config, [*judged.overrides, *overrides])
                 schema.check_mu(settings)
             except ConfigError as error:
                 raise ConfigError(f"study.conditions.{condition}: {error}") from None
-            for protocol, termination in terminations.items():
-                program = _digest_program(config, settings, protocol)
+            for protocol, termination in judged.terminations.items():
+                program = _digest_program(config, settings, protocol, judged.scores)
                 file = training.folder / f"evaluated-{weights}-{program}.csv"
-                yield Evaluation(row, training, weights, condition, protocol, {**settings, "termination": termination}, program, file)
+                task = {**settings, "termination": termination}
+                yield Evaluation(row, training, weights, condition, protocol, task, judged.scores, program, file)
 
 
-def _digest_program(config: Mapping[str, Any], settings: Mapping[str, Any], protocol: str) -> str:
+def _digest_program(config: Mapping[str, Any], settings: Mapping[str, Any], protocol: str, scores: Mapping[str, Any] | None) -> str:
     evaluation = {name: value for name, value in config["evaluation"].items() if name != "bootstrap"}
     path, scenes = config["test_scenes"], settings["scenes"]
     heldout = scenes["heldout"] if path is None else None  # without a path: the recipe's own held-out scenes
     parts = {name: settings[name] for name in (*TASK, "policy")} | {"protocol": protocol, "settings": evaluation}
-    parts |= {"scenes": digest_scenes(scenes, path), "heldout": heldout}
+    parts |= {name: settings["learner"][name] for name in ACTOR if name in settings["learner"]}
+    parts |= {"scenes": digest_scenes(scenes, path), "heldout": heldout} | ({"scores": scores} if scores else {})
     return result_file.digest(parts | _digest_entry(path if heldout is None else heldout["path"]))
 
 

@@ -23,7 +23,7 @@ DIGITS = 5
 AGENTS = "agents"  # folder of the tables of agents
 RowKey = tuple[str, str, str]  # row, condition, protocol
 RowRecords = dict[RowKey, dict[int, dict[str, np.ndarray]]]  # -> seed of training -> records
-REDRAWN = ("question", "figures", "trend")  # keys of a study that decide no number
+REDRAWN = ("question", "figures", "trend", "metrics")  # keys of a study that decide no number
 
 
 def find_folder(config: Mapping[str, Any]) -> Path:
@@ -175,7 +175,7 @@ def _describe_trainings(variant: str, plan: Plan, target: float) -> dict[str, An
 def _describe_run(note: Mapping[str, Any], rows: list[dict[str, float]]) -> dict[str, Any]:
     """Duration of one training; casps: control steps of spawned slots a second, median over iterations."""
     device = note["versions"]["device"] + (f", shared by {note['per_gpu']}" if note.get("per_gpu", 1) > 1 else "")
-    values = {name: note.get(name) for name in ("iterations", "steps", "minutes", "commit", "scenes", "agents")}
+    values = {name: note.get(name) for name in ("iterations", "steps", "hours", "minutes", "commit", "scenes", "agents")}
     return values | {"casps": float(np.median([row["casps"] for row in rows])), "device": device}
 
 

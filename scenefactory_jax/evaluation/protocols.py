@@ -67,9 +67,11 @@ def evaluate_protocols(
             yield Evaluated(protocol, policy, *run(parameters), result_file.digest(parts))
 
 
-def make_evaluator(config: Mapping[str, Any], scenes: scene_source.Scenes, *, settings: Mapping[str, Any]) -> Evaluator:
+def make_evaluator(
+    config: Mapping[str, Any], scenes: scene_source.Scenes, *, settings: Mapping[str, Any], scores: ScoreSettings | None = None
+) -> Evaluator:
     """`episode_records.make_episode_runner`, records alone."""
-    run = episode_records.make_episode_runner(config, scenes, settings=settings, worlds=0)
+    run = episode_records.make_episode_runner(config, scenes, settings=settings, worlds=0, scores=scores)
     return lambda parameters: run(parameters).records
 
 

@@ -178,7 +178,7 @@ def score_world(
         )
         steps = measure_steps(record, dt=STEP_S, surrogates=surrogates)
         record = record._replace(counted=cut_at_failure(record, steps)) if settings.ends_at_failure else record
-        metrics = episode_metrics.collect_metrics(record, steps, dt=STEP_S)
+        metrics = episode_metrics.collect_metrics(record, steps, dt=STEP_S, max_lateral_m=settings.max_lateral_m)
         failures = find_failures(record, steps, metrics, dt=STEP_S) | {COUNTED: record.counted}
         values = metrics | episode_scores.compute_scores(metrics)
         values = {name: jnp.where(valid, value, jnp.nan) for name, (value, valid) in values.items()}

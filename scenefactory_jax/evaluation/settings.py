@@ -7,6 +7,7 @@ from typing import Annotated, Literal
 from scenefactory_jax.core.schema import Bounds, ConfigError, Count, Fraction, NonNegative, Positive, Seed
 from scenefactory_jax.evaluation.failure_signals import SignalThresholds
 from scenefactory_jax.evaluation.failures import TypeThresholds
+from scenefactory_jax.evaluation.metrics.scenarionet_steps import MAX_LATERAL_M
 from scenefactory_jax.evaluation.route_signals import CourseThresholds
 
 Frequency = Annotated[float, Bounds(min=0.1)]
@@ -89,5 +90,6 @@ class ScoreSettings:
     past_rows: Seed  # rows of the log before the start: with scenes.pack.log_from=start
     ends_at_failure: bool  # only states up to the first overlap, off-road state or red light count, as in V-Max's evaluation
     vehicle_kg_per_m2: Positive  # mass of a vehicle of the traffic over its length x width, for delta-v
+    max_lateral_m: Positive = MAX_LATERAL_M  # from its recorded way, from which on an agent is out of road (ScenarioNet)
     noise: NoisyStart | None = None  # before the start; null: as recorded
     wosac: WosacSettings | None = None  # WOSAC's realism of scenes in place of scores of agents

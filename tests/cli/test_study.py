@@ -10,7 +10,7 @@ import jax
 import pytest
 from support import study_parts
 
-from scenefactory_jax.cli import hydra_config, study_plan
+from scenefactory_jax.cli import hydra_config, schema, study_plan
 from scenefactory_jax.cli import study as command
 from scenefactory_jax.cli.study import study
 from scenefactory_jax.core import config as run_config
@@ -192,6 +192,46 @@ def test_a_report_of_a_validation_cut_says_so_and_how_to_repeat_it(done, tmp_pat
     assert "cut=" not in (folder / "out" / "navigation.md").read_text().split("How to repeat it")[1]
 
 
+def test_a_study_has_columns_of_its_own(done, tmp_path):
+    folder, _, _ = done
+    shutil.copytree(folder / "out", tmp_path / "out")
+    study(toy(tmp_path, "parts=draw", metrics=["mean_remaining_m", "road_edge_rate", "nuplan_score"]))
+    text = (tmp_path / "out" / "navigation.md").read_text()
+    assert "|  | Condition | n | Remaining distance | Road-edge rate |" in text and "DRAC" not in text.split("## How to repeat")[0]
+    assert "Remaining distance" in text.split("![")[0] and "nuPlan score" not in text.split("## Each seed")[0]
+    names = [f"metrics-{name}-strict.png" for name in ("dry", "at-random")] + ["differences-strict.png"]
+    assert all(f"({name})" in text and (tmp_path / "out" / name).stat().st_size > 5000 for name in names)
+    with pytest.raises(ConfigError, match=r"study\.metrics.*expected names of success_rate, .*got 'beauty'"):
+        study(toy(tmp_path, "parts=draw", metrics=["beauty"]))
+
+
+def test_findings_are_those_that_holm_leaves_in_a_family():
+    """0.02 is one of three comparisons under `dry`, and the only one under `wet`."""
+    probabilities = [("dry", 0.02), ("dry", 0.001), ("dry", 0.6), ("wet", 0.02), ("wet", None)]
+    changes = [{"condition": name, "protocol": "strict", "change": {"success_rate": {"p": p}}} for name, p in probabilities]
+    assert study_report.find_findings(changes, ["success_rate", "accuracy"]) == {(place, "success_rate") for place in (0, 1, 3)}
+    changes[0]["change"]["success_rate"]["p"] = 0.026
+    assert (0, "success_rate") not in study_report.find_findings(changes, ["success_rate"])
+
+
+def test_a_condition_may_name_a_protocol(tmp_path):
+    """Its settings, scores and terminations take the place of the study's; planners have their overrides of `evaluate`."""
+    conditions = {"dry": [], "planned": ["protocol=vmax_noise", "timing=waymax"]}
+    plan = study_plan.make(toy(tmp_path, **{**ALONE, "conditions": conditions, "planners": ["idm_route"]}))
+    by_condition = {one.condition: one for one in plan.evaluations if one.row == "all scenes"}
+    assert by_condition["dry"].scores is None and by_condition["planned"].scores["noise"]["redraws"] == 8
+    assert [one.protocol for one in by_condition.values()] == ["strict", "whole"]
+    assert by_condition["planned"].config["timing"]["control_hz"] == 10 and by_condition["planned"].config["scenes"]["pack"]["agents"] == 1
+    planner = next(one for one in plan.evaluations if one.row == "idm_route")
+    assert planner.config["policy"]["_target_"].endswith("idm_route.make") and planner.weights == study_plan.UNTRAINED
+    for changes, message in (
+        ({"conditions": {"x": ["protocol=vmix"]}}, r"study\.conditions\.x: .*protocol"),
+        ({"planners": ["pilot"]}, r"study\.planners: expected names of log, expert, .*got 'pilot'"),
+    ):
+        with pytest.raises(ConfigError, match=message):
+            study_plan.make(toy(tmp_path, **{**ALONE, **changes}))
+
+
 def test_a_result_of_other_runs_is_not_written_over_with_nothing(done, tmp_path, capsys):
     folder, result, _ = done
     shutil.copytree(folder / "out", tmp_path / "out")
@@ -356,6 +396,7 @@ def steps_of(config):
     return math.prod([config["iterations"], config["worlds"], config["ppo"]["horizon"], config["actions"]["action_repeat"]])
 
 
+TIMED = {"vmax": "vmax", "scenarionet": "scenarionet", "curriculum": "scenarionet", "learners": "route100"}  # study -> its protocol
 TWINS = {"rewards_laptop", "network_laptop"}  # nearly the same variants as another study, for a CPU
 
 
@@ -364,7 +405,28 @@ def test_names_of_a_study_fit_each_other(name):
     study_plan.check(hydra_config.load_config("study", f"study={name}"))
 
 
-@pytest.mark.parametrize("name", [pytest.param(n, marks=[pytest.mark.slow] if n in TWINS else []) for n in STUDIES])
+@pytest.mark.parametrize("name", sorted(TIMED))
+def test_every_row_of_a_study_of_equal_time_builds(name, tmp_path):
+    """Every learner finds its keys and its network, all judge by the study's protocol, and each row has its time."""
+    entry = hydra_config.load_config("study", f"study={name}", f"runs={tmp_path}", "train_scenes=train.bank", "test_scenes=test.bank")
+    plan = study_plan.make(entry | {"seeds": [0]})
+    assert entry["protocol"]["name"] == TIMED[name] and {one.config["minutes"] for one in plan.trainings} == {entry_minutes(entry)}
+    for one in {one.program: one for one in plan.trainings}.values():
+        schema.check_train(one.config)
+        training_loop.prepare(one.config)
+    for one in {one.program: one for one in plan.evaluations}.values():
+        environment.make_parts(one.config)
+        assert (one.scores is None) == (name == "learners")
+    kinds = {one.program: one.config["learner"].get("actor") for one in plan.evaluations if one.weights == study_plan.TRAINED}
+    assert all(one.config["learner"].get("actor") == kinds.get(one.program) for one in plan.evaluations if one.program in kinds)
+    assert not set(entry["study"]["planners"]) - {one.row for one in plan.evaluations}
+
+
+def entry_minutes(entry):
+    return next(float(word.partition("=")[2]) for word in entry["study"]["common"] if word.startswith("minutes="))
+
+
+@pytest.mark.parametrize("name", [pytest.param(n, marks=[pytest.mark.slow] if n in TWINS else []) for n in STUDIES if n not in TIMED])
 def test_every_study_is_whole(name, tmp_path):
     """Every training and evaluation builds, and what is compared or drawn is evaluated."""
     entry = hydra_config.load_config("study", f"study={name}", f"runs={tmp_path}", "train_scenes=train.bank", "seeds=[0]")

@@ -284,6 +284,9 @@ def test_scenarionet():
     assert found["route_completion"] == pytest.approx(25 / 40, abs=1e-3)  # of the log's 40 m; it begins 10 m before the car
     assert (found["route_success"], found["out_of_road"], found["cost"]) == (0.0, 0.0, 0.0)
     assert judge(drive())["route_success"] == 1.0
+    beside, touched = judge(drive(y=-4.1)), judge(drive(), [(OBJECT, drive(x=3.0), CAR), (PEDESTRIAN, drive(), CONE)])
+    assert (beside["route_success"], beside["out_of_road"], beside["crashes"]) == (0.0, 1.0, 0.0) and beside["route_completion"] < 0.5
+    assert (touched["route_success"], touched["out_of_road"], touched["crashes"]) == (1.0, 0.0, 2.0)
     assert judge(drive(y=-4.1))["cost"] == 30.0  # each state out of road
     assert judge(drive(y=-3.9))["cost"] == 0.0
     assert judge(drive(), [(OBJECT, drive(x=3.0), CAR), (PEDESTRIAN, drive(), CONE)])["cost"] == 60.0

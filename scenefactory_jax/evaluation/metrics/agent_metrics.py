@@ -34,6 +34,11 @@ def _on_route(name: str) -> Callable[[Records], np.ndarray]:
 _has_route = _on_route("has_route")
 
 
+def _has_completion(records: Records) -> np.ndarray:
+    """Agents with a route, and in scored episodes with a recorded way, whose completion then takes the place of the route's."""
+    return np.asarray(_has_route(records), bool) & np.isfinite(np.asarray(_on_route("route_completion")(records), float))
+
+
 def _rate(label: str, definition: str, value: Callable[[Records], np.ndarray], counted=_spawned, *, by_world: bool = False) -> Metric:
     return Metric(label, FRACTION, definition, value, counted, by_world, rate=True, optional=counted is _has_route)
 
@@ -93,7 +98,7 @@ METRICS: dict[str, Metric] = {
         "driving against the lanes for more than a second, of the agents with a route.", _on_route("clean_completion"), _has_route),
     "route_completion": Metric(
         "Route completion", FRACTION, "Part of the route between start and goal that an agent has been on; mean over the agents with a "
-        "route.", _on_route("route_completion"), _has_route, optional=True),
+        "route.", _on_route("route_completion"), _has_completion, optional=True),
     "collisions_per_100_km": Metric(
         "Collisions per 100 km", "1/100 km", "Agents with a route that had a collision, over the distance that all agents with a route "
         "drove.", _column("collision"), _has_route, weight=lambda records: _on_route("driven_m")(records) / 1e5, optional=True),

@@ -235,18 +235,23 @@ def _collect_safety(record: EpisodeRecord, steps: StepMetrics) -> Pairs:
 
 
 def _collect_scenarionet(record: EpisodeRecord, steps: StepMetrics, *, max_lateral_m: float) -> Pairs:
-    """MetaDrive's: completion of the recorded track at the end; cost: states out of road or in contact, each kind for itself."""
+    """MetaDrive's: completion of the recorded track where its episode ends (by arrival, out of road or by time), and contacts until then.
+    Cost: all counted states out of road or in contact, each kind for itself."""
     counted, kind = record.counted, record.others.kind
     length = scenarionet_steps.measure_track(record.log.position[:, :2], record.log.valid)
     has_track = length >= scenarionet_steps.SHORT_TRACK_M
-    completion = steps.track_arc[find_span(record)[1]] / jnp.maximum(length, 1e-6)
+    completion = steps.track_arc / jnp.maximum(length, 1e-6)
     outside = (steps.track_distance > max_lateral_m) & counted & has_track
+    ends = (outside | (completion > scenarionet_steps.SUCCESS_COMPLETION)) & counted
+    last = jnp.where(jnp.any(ends), jnp.argmax(ends), find_span(record)[1])
+    inside = counted & (jnp.arange(len(counted)) <= last)
     contact = lambda *kinds: jnp.any(steps.touching & jnp.isin(kind, jnp.array(kinds)), axis=1) & counted  # noqa: E731
     cost = sum(jnp.sum(flags) for flags in (outside, contact(VEHICLE), contact(PEDESTRIAN, CYCLIST), contact(OBJECT)))
     return {
-        "route_completion": (completion, has_track),
-        "route_success": (completion > scenarionet_steps.SUCCESS_COMPLETION, has_track),
-        "out_of_road": (jnp.any(outside), has_track),
+        "route_completion": (completion[last], has_track),
+        "route_success": ((completion[last] > scenarionet_steps.SUCCESS_COMPLETION) & ~outside[last], has_track),
+        "out_of_road": (outside[last], has_track),
+        "crashes": (jnp.sum(jnp.any(steps.touching & inside[:, None], axis=0)), True),
         "cost": (jnp.asarray(cost), True),
     }
 

@@ -40,6 +40,9 @@ SCORES = {  # in the order of reports: label, unit, definition
     "log_divergence_m": ("Log divergence", "m", "Mean distance from the recorded position (Waymax)."),
     "encroachment_s": ("Post-encroachment time", "s", "Smallest time between two road users on the same place."),
     "delta_v_mps": ("Delta-v", "m/s", "Change of the car's speed in the worst of its first impacts, by the masses of both."),
+    "route_success": ("Arrived", RATE, "Agents that complete more than 95 % of their recorded way, never out of road (ScenarioNet)."),
+    "out_of_road": ("Out of road", RATE, "Agents 4 m (or as the protocol has it) beside their recorded way before arrival (ScenarioNet)."),
+    "crashes": ("Crashes", "", "Road users that the car touches before it arrives or is out of road (ScenarioNet's cost)."),
     "cost": ("Cost", "states", "States beside the recorded way or in contact, each kind for itself (MetaDrive, ScenarioNet)."),
 }  # fmt: skip
 

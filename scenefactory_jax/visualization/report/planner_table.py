@@ -83,15 +83,19 @@ def _list_cells(estimate: Estimate | None) -> list[float | int | None]:
     return [None, None, None, 0] if estimate is None else [estimate.value, estimate.low, estimate.high, estimate.count]
 
 
-@matplotlib.rc_context(plots.STYLE)
 def draw_figure(summary: Mapping[str, Summary]) -> Figure:
-    """Draws bars with 95 % intervals: a panel a metric, a bar a policy; "absent" where there is no value."""
-    metrics = choose_metrics(summary)
-    figure = Figure(figsize=(1.0 + 1.6 * len(metrics), 0.34 * len(summary) + 1.0), layout="constrained")
+    """Draws `draw_panels` of the chosen metrics of each policy."""
+    return draw_panels([name_policy(label) for label in summary], list(summary.values()), choose_metrics(summary))
+
+
+@matplotlib.rc_context(plots.STYLE)
+def draw_panels(labels: Sequence[str], summaries: Sequence[Summary], metrics: Sequence[str]) -> Figure:
+    """Draws bars with 95 % intervals: a panel a metric, a bar a summary; "absent" where there is no value."""
+    figure = Figure(figsize=(1.0 + 1.9 * len(metrics), 0.34 * len(labels) + 1.0), layout="constrained")
     panels = figure.subplots(1, len(metrics), sharey=True, squeeze=False)[0]
     for axes, name in zip(panels, metrics, strict=True):
-        _draw_panel(axes, name, [row.get(name) for row in summary.values()])
-    panels[0].set_yticks(range(len(summary)), [name_policy(label) for label in summary])
+        _draw_panel(axes, name, [summary.get(name) for summary in summaries])
+    panels[0].set_yticks(range(len(labels)), labels)
     panels[0].invert_yaxis()
     return figure
 

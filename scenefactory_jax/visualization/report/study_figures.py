@@ -1,5 +1,6 @@
 """Figures of a study: learning curves, rates, a matrix of variants and conditions, differences, and rates along a number."""
 
+import re
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -10,8 +11,9 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter, NullFormatter, PercentFormatter
 
 from scenefactory_jax.evaluation.metrics.agent_metrics import METRICS
+from scenefactory_jax.evaluation.metrics.metric import FRACTION
 from scenefactory_jax.evaluation.statistics import Estimate
-from scenefactory_jax.visualization.report import plots, run_comparison
+from scenefactory_jax.visualization.report import planner_table, plots, run_comparison
 from scenefactory_jax.visualization.report.plots import COLOURS, STYLE
 from scenefactory_jax.visualization.report.tables import Summary, read_estimates
 
@@ -26,18 +28,26 @@ TREND = (("success_rate", "clean_success_rate"), ("collision_rate", "road_edge_r
 LIGHT = [colour for colour in COLOURS if colour != "#000000"]  # intervals are drawn in black
 
 
+def list_headline(study: Mapping[str, Any]) -> Sequence[str]:
+    """Lists the three metrics that matter most: the first of the study's own, or success, clean success and collisions."""
+    return (study.get("metrics") or HEADLINE)[:3]
+
+
 def draw_all(result: Result) -> Figures:
     """Draws the figures that the study's config lists and has the numbers of."""
     figures: Figures = {}
-    label = (result["study"]["trend"] or {}).get("label")
+    label, points = (result["study"]["trend"] or {}).get("label"), "" if result["study"].get("metrics") else ", percentage points"
     for kind in result["study"]["figures"]:
         if kind == "learning":
             figures |= _draw_training(result)
             continue
+        if kind == "rates" and result["study"].get("metrics"):
+            figures |= _draw_metrics(result)
+            continue
         caption, draw = _MAKERS[kind]
         for protocol in result["study"]["protocols"]:
             if (figure := draw(result, protocol)) is not None:
-                figures[caption.format(protocol=protocol, label=label)] = f"{kind}-{protocol}", figure
+                figures[caption.format(protocol=protocol, label=label, points=points)] = f"{kind}-{protocol}", figure
     return figures
 
 
@@ -72,6 +82,21 @@ def _draw_held_out(curves: Mapping[str, Mapping[Any, Mapping[str, Any]]], target
         axes.set_ylim(bottom=0)
     plots.add_legend(figure, ncols=4)
     return figure
+
+
+def _draw_metrics(result: Result) -> Figures:
+    """A figure for each condition and protocol: a panel for each of the study's metrics, a bar for each row."""
+    groups: dict[tuple[str, str], dict[str, Summary]] = {}
+    for row in result["rows"]:
+        groups.setdefault((row["condition"], row["protocol"]), {})[row["row"]] = read_estimates(row["pooled"])
+    metrics = result["study"]["metrics"]
+    return {
+        f"Metrics with 95 % intervals: {condition} ({protocol})": (
+            f"metrics-{'-'.join(re.findall('[a-z0-9]+', condition.lower()))}-{protocol}",
+            planner_table.draw_panels(list(summaries), list(summaries.values()), metrics),
+        )
+        for (condition, protocol), summaries in groups.items()
+    }
 
 
 def _draw_rates(result: Result, protocol: str) -> Figure | None:
@@ -117,23 +142,26 @@ def _draw_matrix(result: Result, protocol: str) -> Figure | None:
 
 @matplotlib.rc_context(STYLE)
 def _draw_differences(result: Result, protocol: str) -> Figure | None:
-    """Paired differences of success, clean success and collisions, in points."""
+    """Paired differences of the three metrics that matter most."""
     changes = [change for change in result["differences"] if change["protocol"] == protocol]
     if not changes:
         return None
     several = len({change["condition"] for change in changes}) > 1
     figure = Figure(figsize=(10, 0.32 * len(changes) + 1.1), layout="constrained")
-    panels = figure.subplots(1, len(HEADLINE), sharey=True)
-    for axes, name in zip(panels, HEADLINE, strict=True):
-        estimates = {place: Estimate(**change["change"][name]) for place, change in enumerate(changes)}
+    names = list_headline(result["study"])
+    panels = figure.subplots(1, len(names), sharey=True, squeeze=False)[0]
+    for axes, name in zip(panels, names, strict=True):
+        scale, unit = (100, "points") if METRICS[name].unit == FRACTION else (1, METRICS[name].unit)
+        known = [(place, change["change"][name]) for place, change in enumerate(changes) if name in change["change"]]
+        estimates = {place: Estimate(**estimate) for place, estimate in known}
         for place, estimate in estimates.items():
             if estimate.value is not None:
                 low, high = (estimate.value if end is None else end for end in (estimate.low, estimate.high))
                 colour = COLOURS[0] if low > 0 or high < 0 else "#888888"
-                axes.plot([100 * low, 100 * high], [place, place], color=colour, linewidth=2)
-                axes.plot(100 * estimate.value, place, "o", color=colour, markersize=5)
+                axes.plot([scale * low, scale * high], [place, place], color=colour, linewidth=2)
+                axes.plot(scale * estimate.value, place, "o", color=colour, markersize=5)
         axes.axvline(0, color="#222222", linewidth=1)
-        axes.set(title=METRICS[name].label, xlabel="points")
+        axes.set(title=METRICS[name].label, xlabel=unit)
     pairs = [f"{change['before']} → {change['after']}" + (f": {change['condition']}" if several else "") for change in changes]
     panels[0].set_yticks(range(len(changes)), pairs)
     panels[0].invert_yaxis()
@@ -182,6 +210,6 @@ def _rows(result: Result, protocol: str) -> list[Mapping[str, Any]]:
 _MAKERS = {
     "rates": ("Rates with 95 % intervals ({protocol})", _draw_rates),
     "matrix": ("Variants (rows) under conditions (columns), per cent ({protocol}); intervals below", _draw_matrix),
-    "differences": ("Differences with 95 % intervals, percentage points ({protocol})", _draw_differences),
+    "differences": ("Differences with 95 % intervals{points} ({protocol})", _draw_differences),
     "trend": ("Rates against {label}, with 95 % intervals ({protocol})", _draw_trend),
 }

@@ -5,9 +5,11 @@ from pathlib import Path
 from typing import Any
 
 from scenefactory_jax.core import markdown
+from scenefactory_jax.evaluation import statistics
 from scenefactory_jax.evaluation.metrics.agent_metrics import METRICS
 from scenefactory_jax.evaluation.statistics import Estimate
 from scenefactory_jax.visualization.report import document, plots, study_figures, tables
+from scenefactory_jax.visualization.report.policy_comparison import LEVEL
 from scenefactory_jax.visualization.report.tables import PROTOCOLS, format_estimate, read_estimates
 
 Result = Mapping[str, Any]
@@ -18,6 +20,9 @@ SAFETY = ("mean_max_drac", "high_drac_rate", "mean_min_ttc_s", "min_ttc_s", "nea
 CHANGES = ("success_rate", "clean_success_rate", "collision_rate", "road_edge_rate", "crash_rate", "mean_max_drac")
 GROUPS = {"spawning": "Starts", "weather": "Weather", "traffic": "Background traffic", "dynamics": "Dynamics"}  # of an episode
 AS_TRAINED = "as trained"
+LABELS = {name: metric.label for name, metric in METRICS.items()}
+LABELS |= {"success_rate": "success", "clean_success_rate": "without any other event", "collision_rate": "collisions"}
+HOLM = f"\\*: below {LEVEL:g} after Holm's correction for all comparisons of the same metric, condition and protocol."
 INTERPRETATION = "interpretation.md"  # of the result; written by a person
 
 
@@ -35,24 +40,24 @@ def write(folder: Path, result: Result) -> Path:
         _format_missing(result["missing"]),
         *(document.picture(folder, path, caption) for caption, path in pictures.items()),
         document.section("Results", *_results(result, folder)),
-        document.section("Differences", *_differences(result["differences"])),
-        document.section("Each seed", document.fold("Rates of each seed", _each_seed(result["rows"]))),
+        document.section("Differences", *_differences(result["differences"], study.get("metrics") or CHANGES)),
+        document.section("Each seed", document.fold("Values of each seed", _each_seed(result["rows"], study.get("metrics") or RATES))),
         document.section("Trainings", *_trainings(result)),
         document.section("Scenes, and how often they were evaluated", *_scenes(result)),
-        document.section("Definitions", _definitions(result["rows"])),
+        document.section("Definitions", _definitions(result["rows"], study.get("metrics") or (*RATES, *SAFETY))),
         document.section("How to repeat it", *_settings(result)),
     )
 
 
 def format_headline(result: Result) -> str:
-    """Formats success and collisions of every variant, under the first condition and protocol that it was evaluated under."""
+    """Formats the most important metrics of every variant, under the first condition and protocol that it was evaluated under."""
     lines = []
     for name in result["study"]["trainings"]:
         row = next((row for row in result["rows"] if row["row"] == name), None)
         if row:
-            success, clean, collisions = (format_estimate(Estimate(**row["pooled"][metric])) for metric in study_figures.HEADLINE)
             size = f"{document.count(len(row['seeds']), 'seed')} x {row['agents']} agents"
-            rates = f"success {success}, without any other event {clean}, collisions {collisions}"
+            known = [metric for metric in study_figures.list_headline(result["study"]) if metric in row["pooled"]]
+            rates = ", ".join(f"{LABELS[metric]} {format_estimate(Estimate(**row['pooled'][metric]))}" for metric in known)
             lines.append(f"- **{name}** ({row['condition']}, {row['protocol']}; {size}): {rates}")
     return "\n".join(lines) or "Nothing is evaluated yet."
 
@@ -67,13 +72,14 @@ def _format_missing(missing: Sequence[str]) -> str:
 
 def _results(result: Result, folder: Path) -> list[str]:
     """A table of rates and one of safety for each protocol, and links to the tables of agents that stand in `folder`."""
-    parts = []
-    for protocol in result["study"]["protocols"]:
+    parts, chosen = [], result["study"].get("metrics")
+    for protocol in dict.fromkeys(row["protocol"] for row in result["rows"]):
         rows = [row for row in result["rows"] if row["protocol"] == protocol]
         cells = [([row["row"], row["condition"], f"{len(row['seeds'])} x {row['agents']}"], read_estimates(row["pooled"])) for row in rows]
         if rows:
             parts.append(f"### {protocol}: {PROTOCOLS.get(protocol, 'see conf/termination')}")
-            parts += [tables.format_rows(["", "Condition", "n"], cells, metrics) for metrics in (RATES, SAFETY)]
+            groups = (chosen,) if chosen else (RATES, SAFETY)
+            parts += [tables.format_rows(["", "Condition", "n"], cells, metrics) for metrics in groups]
     note = (
         "n: seeds x agents. Brackets: 95 % intervals that resample seeds of training, scenes, and agents within a scene; with one seed "
         "they resample scenes and agents alone, with few seeds they are too narrow. †: Wilson's or Newcombe's score interval over "
@@ -101,38 +107,57 @@ def _episodes(study: Mapping[str, Any]) -> str:
     return "Episodes of each condition:\n\n" + markdown.format_table(["Condition", *GROUPS.values()], cells)
 
 
-def _differences(changes: Sequence[Mapping[str, Any]]) -> list[str]:
+def _differences(changes: Sequence[Mapping[str, Any]], metrics: Sequence[str]) -> list[str]:
     if not changes:
         return []
     cells = [([entry[key] for key in ("before", "after", "condition", "protocol")], read_estimates(entry["change"])) for entry in changes]
-    intervals, without_zero = count_intervals(changes)
+    intervals, without_zero = count_intervals(changes, metrics)
+    has_p = any(entry["change"].get(name, {}).get("p") is not None for entry in changes for name in metrics)
     text = (
         "The second less the first, on the same scenes, cars and seeds. If all true differences were zero, about one 95 % interval in "
-        f"twenty would still exclude zero: {intervals / 20:.1f} of the {intervals} in this table. {without_zero} of them do. No correction "
-        "for multiple comparisons is applied."
+        f"twenty would still exclude zero: {intervals / 20:.1f} of the {intervals} in this table. {without_zero} of them do. "
+        + (HOLM if has_p else "No correction for multiple comparisons is applied.")
     )
-    return [text, tables.format_rows(["From", "To", "Condition", "Protocol"], cells, CHANGES, signed=True)]
+    findings = find_findings(changes, metrics)
+    return [text, tables.format_rows(["From", "To", "Condition", "Protocol"], cells, metrics, signed=True, findings=findings)]
 
 
-def count_intervals(changes: Sequence[Mapping[str, Any]]) -> tuple[int, int]:
+def find_findings(changes: Sequence[Mapping[str, Any]], metrics: Sequence[str]) -> set[tuple[int, str]]:
+    """Finds the differences, as (place in `changes`, metric), that are below LEVEL after Holm's correction in their family: those of the
+    same metric, condition and protocol."""
+    families: dict[tuple[str, ...], dict[tuple[int, str], float]] = {}
+    for place, entry in enumerate(changes):
+        for name in metrics:
+            if (p := entry["change"].get(name, {}).get("p")) is not None:
+                families.setdefault((name, entry["condition"], entry["protocol"]), {})[place, name] = p
+    adjusted = [item for family in families.values() for item in statistics.adjust_holm(family).items()]
+    return {key for key, p in adjusted if p < LEVEL}
+
+
+def count_intervals(changes: Sequence[Mapping[str, Any]], metrics: Sequence[str] = CHANGES) -> tuple[int, int]:
     """Counts the intervals in the table of differences, and those of them that exclude zero."""
-    ends = [(entry["change"][name]["low"], entry["change"][name]["high"]) for entry in changes for name in CHANGES]
+    found = [entry["change"][name] for entry in changes for name in metrics if name in entry["change"]]
+    ends = [(estimate["low"], estimate["high"]) for estimate in found]
     ends = [(low, high) for low, high in ends if low is not None and high is not None]
     return len(ends), sum(low > 0 or high < 0 for low, high in ends)
 
 
-def _each_seed(rows: Sequence[Mapping[str, Any]]) -> str:
+def _each_seed(rows: Sequence[Mapping[str, Any]], metrics: Sequence[str]) -> str:
     cells = []
     for row in rows:
         for seed, values in row["each"].items():
-            rates = ["" if values[name] is None else f"{100 * values[name]:.1f} %" for name in RATES]
-            cells.append([row["row"], row["condition"], row["protocol"], seed, *rates])
-    header = ["", "Condition", "Protocol", "Seed", *(METRICS[name].label for name in RATES)]
+            shown = [_format_value(name, values.get(name)) for name in metrics]
+            cells.append([row["row"], row["condition"], row["protocol"], seed, *shown])
+    header = ["", "Condition", "Protocol", "Seed", *(METRICS[name].label for name in metrics)]
     return markdown.format_table(header, cells) if cells else ""
 
 
-def _definitions(rows: Sequence[Mapping[str, Any]]) -> str:
-    return tables.define_metrics(name for name in (*RATES, *SAFETY) if any(name in row["pooled"] for row in rows))
+def _format_value(name: str, value: float | None) -> str:
+    return "" if value is None else format_estimate(Estimate(value, None, None, 1, METRICS[name].unit, statistics.NONE))
+
+
+def _definitions(rows: Sequence[Mapping[str, Any]], metrics: Sequence[str]) -> str:
+    return tables.define_metrics(name for name in metrics if any(name in row["pooled"] for row in rows))
 
 
 # ---- trainings
@@ -144,15 +169,16 @@ def _trainings(result: Result) -> list[str]:
     for variant, trained in result["trainings"].items():
         for seed, run in trained["runs"].items():
             scenes = "" if run["scenes"] is None else f"{run['scenes']} ({run['agents']} agents)"
-            duration = _steps(run["steps"]), f"{run['minutes']:.1f}", f"{run['casps']:,.0f}"
+            driven = "" if run.get("hours") is None else f"{run['hours']:,.1f}"
+            duration = _steps(run["steps"]), driven, f"{run['minutes']:.1f}", f"{run['casps']:,.0f}"
             cells.append([variant, seed, scenes, run["iterations"], *duration, run["device"], f"`{run['commit']}`"])
     if not cells:
         return []
-    header = ["", "Seed", "Scenes", "Iterations", "Agent steps", "Minutes", "Steps/s", "Device", "Commit"]
+    header = ["", "Seed", "Scenes", "Iterations", "Agent steps", "Hours driven", "Minutes", "Steps/s", "Device", "Commit"]
     total = sum(run["minutes"] for trained in result["trainings"].values() for run in trained["runs"].values())
     text = (
         f"{total:.0f} minutes of training in all. Minutes are those of iterations; the first run of a program compiles it in its first "
-        "iteration. Agent steps are control steps of spawned slots; of the steps a second, the median over iterations."
+        "iteration. Agent steps are control steps of spawned slots, hours those that they drove; of the steps a second, the median."
     )
     return [text, markdown.format_table(header, cells), _to_target(result)]
 

@@ -1,6 +1,6 @@
 """Estimates as text and as Markdown tables, and the definitions below these tables."""
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from typing import Any
 
 from scenefactory_jax.core import markdown
@@ -60,15 +60,26 @@ def format_summaries(summaries: Mapping[str, Summary], *, signed: Sequence[str] 
 
 
 def format_rows(
-    header: Sequence[str], rows: Iterable[tuple[Sequence[object], Summary]], metrics: Iterable[str], *, signed: bool = False
+    header: Sequence[str],
+    rows: Iterable[tuple[Sequence[object], Summary]],
+    metrics: Iterable[str],
+    *,
+    signed: bool = False,
+    findings: Collection[tuple[int, str]] = (),
 ) -> str:
-    """Formats a table with metrics across: each row has leading cells, under `header`, and a summary."""
+    """Formats a table with metrics across: each row has leading cells, under `header`, and a summary.
+
+    Args:
+        findings: (number of a row, metric) of the cells that are marked with a star.
+    """
     rows = list(rows)
+
+    def cell(number: int, summary: Summary, name: str) -> str:
+        star = " \\*" if (number, name) in findings else ""
+        return format_estimate(summary[name], signed=signed) + star if name in summary else ""
+
     names = [name for name in metrics if any(name in summary for _, summary in rows)]
-    cells = [
-        [*leading, *(format_estimate(summary[name], signed=signed) if name in summary else "" for name in names)]
-        for leading, summary in rows
-    ]
+    cells = [[*leading, *(cell(number, summary, name) for name in names)] for number, (leading, summary) in enumerate(rows)]
     return markdown.format_table([*header, *(METRICS[name].label for name in names)], cells)
 
 
