@@ -69,8 +69,8 @@ def policy_traffic(
     Raises:
         ConfigError: no such policy, one of another version, or one whose time between actions is no multiple of the control step.
     """
-    context = {"physics_dt": physics_dt, "control_dt": control_dt}
-    car = instantiate(dynamics, builtins="scenefactory_jax.dynamics", where="traffic.dynamics", friction=friction, **context)()
+    context = {"friction": friction, "physics_dt": physics_dt, "control_dt": control_dt}
+    car = instantiate(dynamics, builtins="scenefactory_jax.dynamics", where="traffic.dynamics", **context)()
     drivers = drivers or load_drivers(run, policy, observations, dynamics)
     parts = make_parts(drivers, car, ending=ending, **context)
     env, masses = environment.assemble(parts), make_masses(mass_kg)
@@ -120,7 +120,8 @@ def load_drivers(
         ConfigError: no such policy, or one whose config lacks a group that is read.
     """
     try:
-        trained = policy_io.load_policy(str(run))
+        with jax.ensure_compile_time_eval():  # learners that are built within a trace build environments
+            trained = policy_io.load_policy(str(run))
     except (ConfigError, FileNotFoundError) as error:
         raise ConfigError(f"{where}: {str(error).removeprefix('run: ')}") from None
     where = f"{where}: {trained.folder}"
@@ -133,7 +134,7 @@ def load_drivers(
     return Drivers(where, config, make_policy(config), {}, np.array([weight], np.float32))
 
 
-def make_parts(drivers: Drivers, dynamics: Dynamics, *, ending: list[EventName], physics_dt: float, control_dt: float) -> EnvParts:
+def make_parts(drivers: Drivers, dynamics: Dynamics, *, ending: list[EventName], control_dt: float, **context: Any) -> EnvParts:
     """Binds the parts of the inner environment: what the policy observes and does is as its config says.
 
     Raises:
@@ -142,7 +143,7 @@ def make_parts(drivers: Drivers, dynamics: Dynamics, *, ending: list[EventName],
     try:
         timing, actions, metrics = (schema.read(drivers.config[name], kind, where=name) for name, kind in READ.items())
         ranges = rewards.read_ranges(drivers.config.get("reward", {}))
-        groups = observations.make(drivers.config["observations"], physics_dt=physics_dt, control_dt=control_dt, reward_ranges=ranges)
+        groups = observations.make(drivers.config["observations"], reward_ranges=ranges, control_dt=control_dt, **context)
         map_action = instantiate(actions.command, builtins="scenefactory_jax.env.actions", where="actions.command")
         spec = history.make_spec(groups.values(), control_dt=control_dt)
     except ConfigError as error:
