@@ -62,11 +62,17 @@ def add_past_policies(make: Callable[[Env], Trainer], env: Env, policy: Policy, 
         window = place(keep(train_state.past, train_state, past))
         return replace(train_state, past=window), metrics | {"past/policies": jnp.sum(window.iteration >= 0, dtype=jnp.float32)}
 
+    def restart(train_state: TrainState, scenes: Scene) -> TrainState:
+        return make_with(train_state.past).restart(train_state, scenes)
+
+    def replace_scenes(train_state: TrainState, *rest: Any) -> tuple[TrainState, Scene]:
+        return make_with(train_state.past).replace_scenes(train_state, *rest)
+
     return Trainer(
         init=jax.jit(init),
         train_iteration=jax.jit(train_iteration, donate_argnums=0),
-        restart=jax.jit(lambda train_state, scenes: make_with(train_state.past).restart(train_state, scenes), donate_argnums=0),
-        replace_scenes=jax.jit(lambda state, *rest: make_with(state.past).replace_scenes(state, *rest), donate_argnums=(0, 1)),
+        restart=jax.jit(restart, donate_argnums=0),
+        replace_scenes=jax.jit(replace_scenes, donate_argnums=(0, 1)),
     )
 
 
