@@ -1,6 +1,6 @@
 """What a pool of policies as background traffic costs: control steps of an environment with each kind of traffic, in turn.
 
-python -m experiments.population.cost [--out FOLDER] [--worlds 16] [--repeats 7]
+python -m experiments.population.cost [--out FOLDER] [--worlds 16] [--repeats 7] [--only log policy 'pool, 4 of one structure']
 
 Policies of one structure are untrained ones of different seeds. Writes `result-cost.json`.
 """
@@ -66,11 +66,12 @@ def compile_steps(words: list[str], worlds: Scene) -> Callable[[], Any]:
     return lambda: jax.block_until_ready(run(state, worlds, jax.random.key(1)))
 
 
-def measure(folder: Path, *, worlds: int, repeats: int) -> dict[str, Any]:
+def measure(folder: Path, *, worlds: int, repeats: int, only: list[str] | None) -> dict[str, Any]:
     """Times all kinds of traffic in turn, so that a busy machine is as busy for each."""
     config = hydra_config.load_config("train", *TASK, f"scenes.count={worlds}")
     loaded = scene_source.load_training_scenes(config["scenes"])
-    calls = {name: compile_steps(words, loaded.scene) for name, words in list_traffic(make_policies(folder, 4, loaded[0])).items()}
+    kinds = list_traffic(make_policies(folder, 4, loaded[0]))
+    calls = {name: compile_steps(words, loaded.scene) for name, words in kinds.items() if only is None or name in only}
     for call in calls.values():
         call()
     times: dict[str, list[float]] = {name: [] for name in calls}
@@ -82,11 +83,8 @@ def measure(folder: Path, *, worlds: int, repeats: int) -> dict[str, Any]:
     base = statistics.median(times["log"])
     vehicles = np.asarray(jnp.sum(loaded.scene.traffic_log.valid.any(-1)))
     relative = {name: [one / base for one in spent] for name, spent in times.items()}
-    rows = {
-        name: {"ms": 1e3 * base / STEPS * statistics.median(of_log), "of_log": statistics.median(of_log), "range": [min(of_log), max(of_log)]}
-        for name, of_log in relative.items()
-    }
-    return {"worlds": worlds, "repeats": repeats, "road_users": int(vehicles), "rows": rows}
+    rows = {name: {"of_log": statistics.median(ratios), "range": [min(ratios), max(ratios)]} for name, ratios in relative.items()}
+    return {"worlds": worlds, "repeats": repeats, "road_users": int(vehicles), "log_ms": 1e3 * base / STEPS, "rows": rows}
 
 
 def main() -> None:
@@ -94,10 +92,11 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--worlds", type=int, default=16)
     parser.add_argument("--repeats", type=int, default=7)
+    parser.add_argument("--only", nargs="*", help="kinds of traffic, log among them; without: all")
     parser.add_argument("--out", type=Path, default=HERE)
     given = parser.parse_args()
     with tempfile.TemporaryDirectory() as folder:
-        found = measure(Path(folder), worlds=given.worlds, repeats=given.repeats)
+        found = measure(Path(folder), worlds=given.worlds, repeats=given.repeats, only=given.only)
     command = f"python -m experiments.population.cost --worlds {given.worlds} --repeats {given.repeats}"
     result = {**found, "command": command, "versions": run_config.versions()}
     given.out.mkdir(parents=True, exist_ok=True)

@@ -67,7 +67,7 @@ def policy_traffic(
         kinds, parked_m, gap_s, mass_kg, start_row, elevation_m: as in `log_traffic`; a parked vehicle is not driven.
 
     Raises:
-        ConfigError: no such policy, one of another version, or one whose time between actions is no multiple of the control step.
+        ConfigError: no such policy, one of another version, or one whose action time is no multiple of the control step.
     """
     context = {"friction": friction, "physics_dt": physics_dt, "control_dt": control_dt}
     car = instantiate(dynamics, builtins="scenefactory_jax.dynamics", where="traffic.dynamics", **context)()
@@ -81,8 +81,7 @@ def policy_traffic(
     def start(key: PRNGKeyArray, scene: Scene, step: Int[Array, ""]) -> Any:
         if _is_empty(scene):
             return ()
-        row = start_row + jnp.round(step * (control_dt / scene.log.dt)).astype(jnp.int32)
-        row = jnp.minimum(row, scene.traffic_log.valid.shape[1] - 1)
+        row = _find_row(scene, step, start_row=start_row, control_dt=control_dt)
         chosen = find_drivers(scene, row, parked_m=parked_m) & ("vehicle" in kinds)
         return init(drivers, env, key, scene, read_logged(scene, step), chosen, step, row, slots=slots)
 
@@ -90,8 +89,7 @@ def policy_traffic(
         if _is_empty(scene):
             return state
         state, boxes, cars = jax.lax.stop_gradient((state, read(scene, state, step), cars))
-        row = start_row + (step + 1) * (control_dt / scene.log.dt)
-        enters = find_entering(state, join(boxes, cars), row, clearance_m=clearance_m)
+        enters = find_entering(state, join(boxes, cars), start_row + (step + 1) * (control_dt / scene.log.dt), clearance_m=clearance_m)
         return advance(parts, env, act, scene, state, boxes, cars, enters, restarts=at_end == "restart")
 
     def read(scene: Scene, state: Any, step: Int[Array, ""]) -> Boxes:
@@ -103,6 +101,12 @@ def policy_traffic(
 
 def _is_empty(scene: Scene) -> bool:
     return scene.traffic_log.kind.shape[0] == 0
+
+
+def _find_row(scene: Scene, step: Int[Array, ""], *, start_row: int, control_dt: float) -> Int[Array, ""]:
+    """Finds the row of the traffic log at a control step, the last one after its end."""
+    row = start_row + jnp.round(step * (control_dt / scene.log.dt)).astype(jnp.int32)
+    return jnp.minimum(row, scene.traffic_log.valid.shape[1] - 1)
 
 
 def load_drivers(

@@ -74,7 +74,7 @@ def test_members_are_drawn_by_weight(runs):
     chosen, driver = map(np.asarray, draw(jax.random.split(jax.random.key(5), draws)))
     counts = [np.sum((chosen == 0) & (driver == 0)), np.sum((chosen == 0) & (driver == 1)), np.sum(chosen == 1), np.sum(chosen == 2)]
     expected = draws * np.array([3, 1, 2, 2]) / 8
-    assert np.sum((counts - expected) ** 2 / expected) < 16.3, counts  # chi-squared with 3 degrees of freedom: one of 1,000 samples is above
+    assert np.sum((counts - expected) ** 2 / expected) < 16.3, counts  # chi-squared, 3 degrees of freedom: one of 1,000 is above
 
 
 # ---- past policies
