@@ -1,24 +1,24 @@
 """Background traffic of a population: every episode of a world draws one of several policies, planners or other kinds of traffic.
 
 All vehicles of a world are of one member. So policies of one structure (equal observations, actions and network) share one inner
-environment and one network, in which each world has the parameters of its own policy: a further one costs next to nothing. Every other
-member is computed in every world.
+environment and one network, in which each world has the parameters of its own policy: a further one costs next to nothing. Past policies
+of the training share another one. Every other member is computed in every world.
 """
 
 import dataclasses
 import functools
 import json
 from collections.abc import Callable, Mapping
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array
+from jaxtyping import Array, Int
 
 from scenefactory_jax.core.instantiate import instantiate
 from scenefactory_jax.core.schema import ConfigError, Count, Positive
-from scenefactory_jax.core.types import PastPolicies, Traffic
+from scenefactory_jax.core.types import Boxes, PastPolicies, Policy, Scene, Traffic
 from scenefactory_jax.env import rewards, traffic
 from scenefactory_jax.env.traffic.mixed import mix_traffic
 from scenefactory_jax.learning import policy_traffic
@@ -34,6 +34,12 @@ class Past:
 
     slots: Count  # policies that are kept
     every: Count  # iterations after which the newest replaces the oldest
+
+
+class BoundState(NamedTuple):
+    """The state of traffic with past policies. Traffic without them can read it, for learners that have an environment of their own."""
+
+    state: Any
 
 
 def pool_traffic(
@@ -70,18 +76,36 @@ def pool_traffic(
     fixed = [_load(name, share, kinds) for name, share in shares.items() if name not in kinds and name != PAST]
     make_vehicles = instantiate(vehicles, builtins=policy_traffic, where="traffic.vehicles", **context)
 
-    def build(policies: list[tuple[Drivers, float]]) -> Traffic:
-        parts = [(make_vehicles(drivers), share) for drivers, share in group(policies)] + others
-        if not parts:
-            return make_kind(LOG)
-        return parts[0][0] if len(parts) == 1 else mix_traffic([part for part, _ in parts], [share for _, share in parts])
+    parts = [(make_vehicles(drivers), share) for drivers, share in group(fixed)] + others
+    found = _mix(parts) if parts else make_kind(LOG)
+    if PAST not in shares:
+        return found
+
+    # built where it acts: an environment that only reads the traffic may have other observations
+    policy = Policy(lambda *inputs: make_policy(config).init(*inputs), lambda *inputs: make_policy(config).apply(*inputs))
 
     def bind(parameters: Any, there: Array) -> Traffic:
-        own = Drivers(f"traffic.members: {PAST}", dict(config), make_policy(config), parameters, shares[PAST] * there / jnp.sum(there))
-        return build([*fixed, (own, shares[PAST])])
+        drivers = Drivers(f"traffic.members: {PAST}", dict(config), policy, parameters, there / jnp.sum(there))
+        return _mark(_mix([*parts, (make_vehicles(drivers), shares[PAST])]))
 
-    found = build(fixed)
-    return found._replace(past=PastPolicies(past.slots, past.every, bind)) if PAST in shares else found
+    def read(scene: Scene, state: Any, step: Int[Array, ""]) -> Boxes:
+        reader = bind({}, jnp.ones(past.slots)) if isinstance(state, BoundState) else found
+        return reader.read(scene, state, step)
+
+    return found._replace(read=read, past=PastPolicies(past.slots, past.every, bind))
+
+
+def _mix(parts: list[tuple[Traffic, float]]) -> Traffic:
+    return parts[0][0] if len(parts) == 1 else mix_traffic([part for part, _ in parts], [share for _, share in parts])
+
+
+def _mark(bound: Traffic) -> Traffic:
+    """Marks the states of traffic as ones with past policies."""
+    return Traffic(
+        lambda *arguments: BoundState(bound.init(*arguments)),
+        lambda scene, state, *rest: BoundState(bound.advance(scene, state.state, *rest)),
+        lambda scene, state, step: bound.read(scene, state.state, step),
+    )
 
 
 def _read_weights(members: list[str], weights: list[float] | None) -> list[float]:
@@ -126,9 +150,6 @@ def describe_structure(drivers: Drivers) -> str:
 
 
 def _join(one: Drivers, other: Drivers) -> Drivers:
-    join = lambda *leaves: (np if all(isinstance(leaf, np.ndarray) for leaf in leaves) else jnp).concatenate(leaves)  # noqa: E731
-    return one._replace(
-        where=f"{one.where}, {other.where.partition(': ')[2]}",
-        parameters=jax.tree.map(join, one.parameters, other.parameters),
-        weights=join(one.weights, other.weights),
-    )
+    join = lambda *leaves: np.concatenate(leaves)  # noqa: E731
+    parameters, weights = jax.tree.map(join, (one.parameters, one.weights), (other.parameters, other.weights))
+    return one._replace(where=f"{one.where}, {other.where.partition(': ')[2]}", parameters=parameters, weights=weights)

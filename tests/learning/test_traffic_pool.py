@@ -47,7 +47,7 @@ def pasts(runs):
             state = bound.init(key, scene, jnp.int32(0))
             move = lambda state, step: (bound.advance(scene, state, ABSENT, step), None)  # noqa: E731
             end, _ = jax.lax.scan(move, state, jnp.arange(STEPS))
-            return state.driver, bound.read(scene, end, jnp.int32(STEPS)).position
+            return state.state.driver, bound.read(scene, end, jnp.int32(STEPS)).position
 
         return jax.vmap(drive)(jax.random.split(jax.random.key(0), 6))
 
@@ -96,13 +96,18 @@ def test_past_policies_are_arguments_of_the_program(runs, pasts):
     assert pasts._cache_size() == 1
 
 
-def test_past_and_other_policies_of_one_structure_share_a_network(runs):
-    trained = policy_io.load_policy(runs[0])
-    pool = make_pool("past", runs[1], "log", config=trained.config, weights=[2.0, 1.0, 1.0])
-    stacked = jax.tree.map(lambda leaf: jnp.stack([leaf] * 3), trained.parameters)
-    there = jnp.array([True, True, False])
-    state = jax.eval_shape(lambda: pool.past.bind(stacked, there).init(jax.random.key(0), street(), jnp.int32(0)))
-    assert len(state.states) == 2, "the policies, and the log"
+def test_an_environment_without_past_policies_reads_the_traffic_with_them(runs):
+    """The experts of learners have environments of their own, with other observations, in which past policies are not bound."""
+    trained, scene, step = policy_io.load_policy(runs[0]), street(), jnp.int32(0)
+    pool, other = (make_pool("past", runs[1], "log", config=config) for config in (trained.config, trained.config | {"observations": {}}))
+    bound = pool.past.bind(jax.tree.map(lambda leaf: leaf[None], trained.parameters), jnp.array([True]))
+
+    @jax.jit
+    def read(key):
+        state = bound.init(key, scene, step)
+        return bound.read(scene, state, step), other.read(scene, state, step)
+
+    jax.tree.map(np.testing.assert_array_equal, *read(jax.random.key(0)))
 
 
 def test_without_a_training_past_policies_are_left_out(runs):
