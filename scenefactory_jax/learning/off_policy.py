@@ -25,7 +25,7 @@ from scenefactory_jax.core.schema import ConfigError, Count, Positive
 from scenefactory_jax.core.types import Env, Observation, Policy, Scene
 from scenefactory_jax.learning import replay_buffer, rollout, trainer
 from scenefactory_jax.learning.replay_buffer import Buffer, Storage
-from scenefactory_jax.learning.rollout import Act, Counts, Outcome, SceneStats, Transition, Worlds
+from scenefactory_jax.learning.rollout import Act, Counts, Disturb, Outcome, SceneStats, Transition, Worlds
 from scenefactory_jax.learning.trainer import Metrics, Trainer, TrainState
 
 T = TypeVar("T")
@@ -77,6 +77,7 @@ class Learner(NamedTuple):
     make_rows: Callable[[Transition], tuple[Any, Bool[Array, "T W A"]]]  # what is stored of transitions, and which of it
     update: Callable[[Learnt, Any, Float[Array, "G B"], PRNGKeyArray], tuple[Learnt, Metrics]]  # (learnt, rows, weight, key); the metrics
     # have `changed`, whether the update was finite
+    disturb: Disturb | None = None  # what becomes of the actions before they are made
 
 
 class Rounds(NamedTuple):
@@ -110,7 +111,7 @@ def run_rounds(
         learnt, buffer, worlds = carry
         act_key, update_key = jax.random.split(key)
         worlds, transitions, counts, scene_stats = rollout.collect_transitions(
-            rounds.env, learner.act(learnt), scenes, worlds, act_key, steps=config.unroll, axis=axis
+            rounds.env, learner.act(learnt), scenes, worlds, act_key, steps=config.unroll, disturb=learner.disturb, axis=axis
         )
         rows, valid = learner.make_rows(transitions)
         counts["stored"], counts["lost"] = jnp.sum(valid), jnp.sum(transitions.known & transitions.outcome.active & ~valid)

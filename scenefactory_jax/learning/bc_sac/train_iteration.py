@@ -20,9 +20,9 @@ from scenefactory_jax.env import environment
 from scenefactory_jax.learning import off_policy, replay_buffer, trainer
 from scenefactory_jax.learning.bc import train_iteration as bc
 from scenefactory_jax.learning.bc_sac.config import BCSACConfig
-from scenefactory_jax.learning.expert import make_expert
+from scenefactory_jax.learning.expert import make_disturbance, make_expert
 from scenefactory_jax.learning.off_policy import Rounds
-from scenefactory_jax.learning.rollout import Act
+from scenefactory_jax.learning.rollout import Act, Disturb
 from scenefactory_jax.learning.sac import train_iteration as sac
 from scenefactory_jax.learning.trainer import Metrics, Trainer, TrainState
 
@@ -66,10 +66,19 @@ def start_anew(rounds: Rounds, train_state: TrainState, scenes: Scene, key: PRNG
     return replace(train_state, worlds=trainer.start_each_world(rounds.env, keys, scenes, starts=starts))
 
 
-def make_trainer(env: Env, policy: Policy, config: BCSACConfig, expert: Act, *, episode_steps: int, mesh: Mesh | None = None) -> Trainer:
+def make_trainer(
+    env: Env,
+    policy: Policy,
+    config: BCSACConfig,
+    expert: Act,
+    *,
+    episode_steps: int,
+    disturb: Disturb | None = None,
+    mesh: Mesh | None = None,
+) -> Trainer:
     """Builds a trainer for one environment, one policy and one expert; arguments as of PPO."""
     imitation, axis = config.get_imitation(), off_policy.get_axis(mesh)
-    cloner, learner = bc.make_learner(policy, imitation, expert, axis), sac.make_learner(policy, config, axis)
+    cloner, learner = bc.make_learner(policy, imitation, expert, disturb, axis), sac.make_learner(policy, config, axis)
     reinforcing = off_policy.make_rounds("sac", env, learner, config, mesh)
     cloning = off_policy.make_rounds("bc", env, cloner, imitation, mesh, key="expert_buffer")
     starts = off_policy.count_starts(env, config, episode_steps=episode_steps)
@@ -80,5 +89,6 @@ def make_trainer(env: Env, policy: Policy, config: BCSACConfig, expert: Act, *, 
 
 def make(config: Mapping[str, Any], env: Env, policy: Policy, *, mesh: Mesh | None = None) -> Trainer:
     """Builds the trainer of a config whose `learner` is BC-SAC."""
-    numbers, expert = off_policy.read_numbers(config, BCSACConfig), make_expert(config)
-    return make_trainer(env, policy, numbers, expert, episode_steps=environment.episode_steps(config["timing"]), mesh=mesh)
+    numbers, steps = off_policy.read_numbers(config, BCSACConfig), environment.episode_steps(config["timing"])
+    disturb = make_disturbance(numbers.expert_noise, config)
+    return make_trainer(env, policy, numbers, make_expert(config), episode_steps=steps, disturb=disturb, mesh=mesh)
