@@ -32,8 +32,8 @@ class Noise:
     part: Fraction  # of the agents that have it in an episode
 
 
-def make_expert(config: Mapping[str, Any]) -> Act:
-    """Builds the expert of a config whose `learner` has the entry `expert`, an option of the group `policy`.
+def make_expert(config: Mapping[str, Any]) -> Act | None:
+    """Builds the expert of a config whose `learner` has the entry `expert`, an option of the group `policy`; None: it has recorded samples.
 
     It drives the cars of the run. It observes the groups of its own `observations`, in which `action_s` is the run's time between two
     actions, or the run's groups if it has none. Its action is one to learn from where the agent is within its log, if it follows one.
@@ -41,6 +41,8 @@ def make_expert(config: Mapping[str, Any]) -> Act:
     Raises:
         ConfigError: a planner that does not fit.
     """
+    if config["learner"]["samples"] is not None:
+        return None
     entry = set_action_time(config["learner"]["expert"], config)
     env = environment.make_env({**config, "observations": entry.get("observations", config["observations"])})
     planner = instantiate(entry, builtins=late_fusion, where="learner.expert", dynamics=config["dynamics"])()

@@ -19,6 +19,7 @@ class BCConfig(OffPolicyConfig):
     loss: Loss
     expert: dict[str, Any]  # an entry of the group `policy`
     expert_noise: Noise
+    samples: str | None  # folder that `record` wrote; None: the expert drives in the worlds
 
     def __post_init__(self) -> None:
         super().__post_init__()

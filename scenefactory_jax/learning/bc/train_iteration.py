@@ -73,24 +73,24 @@ def update(bc: BC, learnt: Learnt, rows: dict[str, Any], weight: Float[Array, "G
     return off_policy.select(metrics["changed"], Learnt(parameters, (), state), learnt), metrics
 
 
-def make_learner(policy: Policy, config: BCConfig, expert: Act, disturb: Disturb | None, axis: str | None) -> Learner:
-    """Binds the functions."""
+def make_learner(policy: Policy, config: BCConfig, expert: Act | None, disturb: Disturb | None, axis: str | None) -> Learner:
+    """Binds the functions; without an expert, recorded samples fill the buffer."""
     bc = BC(policy, config, axis)
-    parts = (functools.partial(part, bc) for part in (make_rows, update))
-    return Learner(functools.partial(init, bc), lambda learnt: expert, *parts, disturb)
+    act = None if expert is None else lambda learnt: expert
+    return Learner(functools.partial(init, bc), act, functools.partial(make_rows, bc), functools.partial(update, bc), disturb)
 
 
 def make_trainer(
     env: Env,
     policy: Policy,
     config: BCConfig,
-    expert: Act,
+    expert: Act | None,
     *,
     episode_steps: int,
     disturb: Disturb | None = None,
     mesh: Mesh | None = None,
 ) -> Trainer:
-    """Builds a trainer for one environment, one policy and one expert; arguments as of PPO."""
+    """Builds a trainer for one environment, one policy and one expert (None: its samples are recorded); arguments as of PPO."""
     rounds = off_policy.make_rounds("bc", env, make_learner(policy, config, expert, disturb, off_policy.get_axis(mesh)), config, mesh)
     return off_policy.make_trainer(rounds, policy, episode_steps=episode_steps, mesh=mesh)
 
@@ -98,5 +98,5 @@ def make_trainer(
 def make(config: Mapping[str, Any], env: Env, policy: Policy, *, mesh: Mesh | None = None) -> Trainer:
     """Builds the trainer of a config whose `learner` is BC."""
     numbers, steps = off_policy.read_numbers(config, BCConfig), environment.episode_steps(config["timing"])
-    disturb = make_disturbance(numbers.expert_noise, config)
-    return make_trainer(env, policy, numbers, make_expert(config), episode_steps=steps, disturb=disturb, mesh=mesh)
+    expert, disturb = make_expert(config), make_disturbance(numbers.expert_noise, config)
+    return make_trainer(env, policy, numbers, expert, episode_steps=steps, disturb=disturb, mesh=mesh)

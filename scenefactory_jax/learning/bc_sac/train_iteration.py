@@ -38,6 +38,8 @@ def train_iteration(
 
     @jax.jit
     def clone(train_state: TrainState) -> tuple[TrainState, Metrics]:
+        if cloning.learner.act is None:
+            return off_policy.train_iteration(cloning, train_state, scenes)
         before, after, key = jax.random.split(train_state.key, 3)
         train_state = start_anew(cloning, replace(train_state, key=key), scenes, before, starts=starts)
         train_state, metrics = off_policy.train_iteration(cloning, train_state, scenes)
@@ -70,13 +72,13 @@ def make_trainer(
     env: Env,
     policy: Policy,
     config: BCSACConfig,
-    expert: Act,
+    expert: Act | None,
     *,
     episode_steps: int,
     disturb: Disturb | None = None,
     mesh: Mesh | None = None,
 ) -> Trainer:
-    """Builds a trainer for one environment, one policy and one expert; arguments as of PPO."""
+    """Builds a trainer for one environment, one policy and one expert (None: its samples are recorded); arguments as of PPO."""
     imitation, axis = config.get_imitation(), off_policy.get_axis(mesh)
     cloner, learner = bc.make_learner(policy, imitation, expert, disturb, axis), sac.make_learner(policy, config, axis)
     reinforcing = off_policy.make_rounds("sac", env, learner, config, mesh)
@@ -84,11 +86,12 @@ def make_trainer(
     starts = off_policy.count_starts(env, config, episode_steps=episode_steps)
     init = functools.partial(off_policy.init_train_state, [reinforcing, cloning], policy=policy, starts=starts)
     iterate = functools.partial(train_iteration, cloning, reinforcing, config.imitation_every, starts)
-    return trainer.compile_trainer(init, iterate, env, starts=starts, mesh=mesh)
+    recorded = cloning.name if expert is None else None
+    return trainer.compile_trainer(init, iterate, env, starts=starts, mesh=mesh, recorded=recorded)
 
 
 def make(config: Mapping[str, Any], env: Env, policy: Policy, *, mesh: Mesh | None = None) -> Trainer:
     """Builds the trainer of a config whose `learner` is BC-SAC."""
     numbers, steps = off_policy.read_numbers(config, BCSACConfig), environment.episode_steps(config["timing"])
-    disturb = make_disturbance(numbers.expert_noise, config)
-    return make_trainer(env, policy, numbers, make_expert(config), episode_steps=steps, disturb=disturb, mesh=mesh)
+    expert, disturb = make_expert(config), make_disturbance(numbers.expert_noise, config)
+    return make_trainer(env, policy, numbers, expert, episode_steps=steps, disturb=disturb, mesh=mesh)
