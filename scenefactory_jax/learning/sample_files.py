@@ -110,7 +110,7 @@ def check_fit(folder: Path, index: Index, config: Mapping[str, Any], expected: M
     for name, leaf in expected.items():
         found = index.arrays.get(name)
         if found is None:
-            raise ConfigError(f"learner.samples: {folder} has no {name}; `record next_observations=true` writes it")
+            raise ConfigError(f"learner.samples: {folder} has no {name}; `record samples.next_observations=true` writes it")
         if tuple(found["shape"]) != tuple(leaf.shape) or found["dtype"] != str(leaf.dtype):
             old = f"{tuple(found['shape'])} {found['dtype']}"
             raise ConfigError(f"learner.samples: {folder} has {name} as {old}, the run needs {tuple(leaf.shape)} {leaf.dtype}")

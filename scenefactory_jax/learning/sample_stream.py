@@ -13,15 +13,16 @@ from typing import Any
 import jax
 import numpy as np
 from jax.sharding import Mesh
-from jaxtyping import Bool
+from jaxtyping import Array, Bool
 
 from scenefactory_jax.core import result_file, sharding
 from scenefactory_jax.core.schema import ConfigError
 from scenefactory_jax.learning import sample_files
-from scenefactory_jax.learning.sample_files import Index
+from scenefactory_jax.learning.sample_files import Arrays, Index
 from scenefactory_jax.learning.trainer import Trainer, TrainState
 
-Chunk = tuple[Any, Bool[np.ndarray, " M"]]  # rows and which of them are samples, on the devices
+VALID = "valid"
+Chunk = tuple[Any, Bool[Array, " M"]]  # rows and which of them are samples, on the devices
 
 
 class SampleStream:
@@ -71,7 +72,8 @@ def open_stream(
         return
     folder, learner = Path(config["learner"]["samples"]), config["learner"]
     index, rings = sample_files.read_index(folder), train_state.buffer[trainer.recorded].rows
-    expected = sample_files.name_rows(jax.tree.map(lambda leaf: jax.ShapeDtypeStruct(leaf.shape[2:], leaf.dtype), rings))
+    row = jax.tree.map(lambda leaf: jax.ShapeDtypeStruct(leaf.shape[2:], leaf.dtype), rings)
+    expected = sample_files.name_rows(row)
     sample_files.check_fit(folder, index, config, expected)
     groups, capacity = jax.tree.leaves(rings)[0].shape[:2]
     shares = [-(-rows // groups) for rows in index.rows]  # samples of a chunk in each group
@@ -85,7 +87,10 @@ def open_stream(
 
     def load(position: int) -> Chunk:
         number = int(orders(position // len(shares))[position % len(shares)])
-        return place_chunk(folder, number, index.rows[number], rings, list(expected), size=max(shares), mesh=mesh)
+        arrays = sample_files.read_chunk(folder, number, list(expected), rows=index.rows[number])
+        chunk = divide(arrays, groups, size=max(shares))
+        rows = jax.tree.unflatten(jax.tree.structure(row), [chunk[name] for name in expected])
+        return jax.block_until_ready(sharding.place_on_devices((rows, chunk[VALID]), mesh))
 
     with ThreadPoolExecutor(1, thread_name_prefix="samples") as thread:
         submit = lambda position: thread.submit(load, position)  # noqa: E731
@@ -95,15 +100,8 @@ def open_stream(
         yield stream
 
 
-def place_chunk(folder: Path, number: int, rows: int, rings: Any, names: list[str], *, size: int, mesh: Mesh | None) -> Chunk:
-    """Reads a chunk onto the devices: `size` rows for each group of the buffer, to which its samples go in turn.
-
-    Args:
-        rings: the buffer's rows.
-        names: paths of its arrays, in the order of its leaves.
-    """
-    groups = len(jax.tree.leaves(rings)[0])
-    turn = np.arange(groups * size).reshape(size, groups).T.ravel()  # group after group
-    arrays = sample_files.read_chunk(folder, number, names, rows=rows)
-    leaves = [arrays[name][np.minimum(turn, rows - 1)] for name in names]
-    return jax.block_until_ready(sharding.place_on_devices((jax.tree.unflatten(jax.tree.structure(rings), leaves), turn < rows), mesh))
+def divide(arrays: Arrays, groups: int, *, size: int) -> Arrays:
+    """Divides samples among groups in turn: `size` rows for each, one group after the other, and a mask `VALID` of those with a sample."""
+    rows = len(next(iter(arrays.values())))
+    turn = np.arange(groups * size).reshape(size, groups).T.ravel()
+    return {name: value[np.minimum(turn, rows - 1)] for name, value in arrays.items()} | {VALID: turn < rows}

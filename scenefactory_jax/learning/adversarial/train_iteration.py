@@ -65,7 +65,7 @@ def train_iteration(imitation: Imitation, train_state: TrainState, scenes: Scene
     collected = ppo_iteration.collect(ppo, train_state, scenes, rollout_key)
     buffer = train_state.buffer[name]
     if imitation.expert is not None:
-        drive = functools.partial(drive_expert, imitation, imitation.expert, scenes, expert_key)
+        drive = functools.partial(drive_expert, imitation, scenes, expert_key)
         buffer = jax.lax.cond(train_state.iteration % config.expert_every == 0, drive, lambda buffer: buffer, buffer)
 
     pairs = make_policy_pairs(imitation, train_state.parameters, collected)
@@ -80,12 +80,13 @@ def train_iteration(imitation: Imitation, train_state: TrainState, scenes: Scene
     return to_strong_type(train_state), rest | {f"{name}/{part}": value for part, value in metrics.items()}
 
 
-def drive_expert(imitation: Imitation, expert: Act, scenes: Scene, key: PRNGKeyArray, buffer: Buffer) -> Buffer:
+def drive_expert(imitation: Imitation, scenes: Scene, key: PRNGKeyArray, buffer: Buffer) -> Buffer:
     """Lets the expert drive in all worlds from the start of an episode, and stores its transitions.
 
     Of an episode that may not fit into the buffer a random part is stored, so that its end does not crowd out its start.
     """
-    env, axis, steps = imitation.ppo.env, imitation.ppo.axis, imitation.expert_steps
+    env, axis, steps, expert = imitation.ppo.env, imitation.ppo.axis, imitation.expert_steps, imitation.expert
+    assert expert is not None
     start_key, drive_key = jax.random.split(key)
     count = len(jax.tree.leaves(scenes)[0])
     worlds = trainer.start_each_world(env, sharding.world_keys(start_key, count, axis), scenes, starts=1)
