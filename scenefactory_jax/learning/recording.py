@@ -49,12 +49,12 @@ def record(config: Mapping[str, Any]) -> Index:
         SceneError: scenes that cannot be read.
     """
     settings, learner = schema.read(config["samples"], RecordConfig, where="samples"), config["learner"]
-    noise, folder = schema.read(learner["expert_noise"], Noise, where="learner.expert_noise"), Path(config["out"])
-    disturb, expert = make_disturbance(noise, config), make_expert(config)
+    noise, folder, expert = learner.get("expert_noise"), Path(config["out"]), make_expert(config)
+    disturb = None if noise is None else make_disturbance(schema.read(noise, Noise, where="learner.expert_noise"), config)
     if expert is None:
         raise ConfigError(f"learner.samples: expected null, got {learner['samples']}")
     if settings.next_observations and disturb is not None:
-        part = f"learner.expert_noise.part={noise.part}"
+        part = f"learner.expert_noise.part={learner['expert_noise']['part']}"
         raise ConfigError(f"samples.next_observations: expected false beside {part}, whose noise changes what follows")
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
         raise ConfigError(f"out={folder}: expected a new or an empty folder")
@@ -66,7 +66,7 @@ def record(config: Mapping[str, Any]) -> Index:
     if not rows:
         raise ConfigError("learner.expert: nothing to record: no agent is within a log; an expert that follows logs needs spawning=logged")
     about = {name: config["scenes"].get(name) for name in ("path", "seed", "count")}
-    about = {"scenes": about, **{name: learner[name] for name in ("expert", "expert_noise")}, "seed": config["seed"], **configs.versions()}
+    about = {"scenes": about, "expert": learner["expert"], "expert_noise": noise, "seed": config["seed"], **configs.versions()}
     index = Index(rows, arrays, sample_files.describe_config(config), about)
     sample_files.write_index(folder, index)
     LOG.info(f"{sum(rows):,} samples in {len(rows)} chunks: {folder}")

@@ -78,7 +78,8 @@ def open_stream(
     groups, capacity = jax.tree.leaves(rings)[0].shape[:2]
     shares = [-(-rows // groups) for rows in index.rows]  # samples of a chunk in each group
     if max(shares) > capacity:
-        raise ConfigError(f"learner.buffer: expected at least the {max(index.rows)} samples of a chunk of {folder}, got {learner['buffer']}")
+        key = "expert_buffer" if "expert_buffer" in learner else "buffer"
+        raise ConfigError(f"learner.{key}: expected at least the {max(index.rows)} samples of a chunk of {folder}, got {learner[key]}")
     orders = lambda epoch: np.random.default_rng((config["seed"], epoch)).permutation(len(shares))  # noqa: E731
     first = int(np.searchsorted(np.cumsum(np.array(shares)[orders(0)]), capacity, side="right"))
     few, starts = sum(index.rows[number] for number in orders(0)[:first]), learner.get("learning_starts", 0)
