@@ -5,6 +5,7 @@ the place of the oldest samples. Chunks come in a new order every epoch, which d
 """
 
 import contextlib
+import logging
 from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
@@ -21,6 +22,7 @@ from scenefactory_jax.learning import sample_files
 from scenefactory_jax.learning.sample_files import Arrays, Index
 from scenefactory_jax.learning.trainer import Trainer, TrainState
 
+LOG = logging.getLogger(__name__)
 VALID = "valid"
 Chunk = tuple[Any, Bool[Array, " M"]]  # rows and which of them are samples, on the devices
 
@@ -98,6 +100,7 @@ def open_stream(
         stream = SampleStream(index, submit, first=first, position=0 if before is None else before["position"])
         if before is not None and before["index"] != stream.state()["index"]:
             raise ConfigError(f"resume=true: learner.samples: {folder} has changed since the run began; restore it from a copy")
+        LOG.info(f"{sum(index.rows):,} samples of {folder} in {len(shares)} chunks, of which the buffer takes {first}")
         yield stream
 
 
