@@ -68,11 +68,16 @@ def add_past_policies(make: Callable[[Env], Trainer], env: Env, policy: Policy, 
     def replace_scenes(train_state: TrainState, *rest: Any) -> tuple[TrainState, Scene]:
         return make_with(train_state.past).replace_scenes(train_state, *rest)
 
+    def put_samples(train_state: TrainState, *rows: Any) -> TrainState:
+        return make_with(train_state.past).put_samples(train_state, *rows)
+
     return Trainer(
         init=jax.jit(init),
         train_iteration=jax.jit(train_iteration, donate_argnums=0),
         restart=jax.jit(restart, donate_argnums=0),
         replace_scenes=jax.jit(replace_scenes, donate_argnums=(0, 1)),
+        put_samples=jax.jit(put_samples, donate_argnums=0),
+        recorded=make(past.bind({}, jnp.ones(past.slots))).recorded,
     )
 
 

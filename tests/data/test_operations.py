@@ -433,7 +433,7 @@ def test_banks_are_judged_and_compared(town, tmp_path):
         (["op=quality"], "out: expected a folder for the report, got null"),
         (["op=export", "export.format=bvh", "out=x"], "export.format: expected gpudrive or scenarionet, got 'bvh'"),
         (["op=export"], "out: expected a folder for the files, got null"),
-        (["op=polish"], "op: 'polish'; valid: check, quality, compare, simulate, info, select, split, export$"),
+        (["op=polish"], "op: 'polish'; valid: check, quality, compare, simulate, info, select, split, egos, export$"),
         (["op=select", "select.filter='cars > 3'"], "select.filter: unknown column 'cars'"),
         (["op=select", "select.filter='vehicles > 300'"], "none of 12 scenes meets it"),
         (["op=split"], "split.fractions: expected a fraction per part"),
