@@ -135,6 +135,15 @@ class ExportScenes:
 
 
 @dataclass(frozen=True)
+class Egos:
+    """`scenes op=egos`."""
+
+    count: Count | None
+    min_travel_m: Annotated[float, Bounds(min=0.0)]
+    keep_recording_car: bool
+
+
+@dataclass(frozen=True)
 class SceneOperations(Task):
     """The command `scenes`."""
 
@@ -149,6 +158,7 @@ class SceneOperations(Task):
     info: Info
     select: Select
     split: Split
+    egos: Egos
     export: ExportScenes
     scenes: ScenesConfig
     features: Group | None

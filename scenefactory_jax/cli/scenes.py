@@ -126,5 +126,6 @@ OPERATIONS: dict[str, Callable[[Mapping[str, Any]], Any]] = {
     "info": scene_operations.info,
     "select": scene_operations.select,
     "split": scene_operations.split,
+    "egos": scene_operations.egos,
     "export": scene_operations.export,
 }

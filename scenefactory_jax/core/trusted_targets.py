@@ -12,7 +12,7 @@ from scenefactory_jax.core.instantiate import ConfigError
 
 PACKAGE = "scenefactory_jax"
 # Modules with parts of a run. None of them starts programs, imports by a given name, or writes files
-PARTS = ("roadgraph", "dynamics", "weather", "loggers", "env", "learning.networks", "learning.policy_traffic")
+PARTS = ("roadgraph", "dynamics", "weather", "loggers", "env", "learning.networks", "learning.policy_traffic", "learning.traffic_pool")
 PARTS += tuple(f"learning.{learner}" for learner in ("ppo", "sac", "td3", "bc", "bc_sac", "adversarial", "copo"))
 PARTS += ("evaluation.planners", "data.formats", "data.packing", "data.generators", "data.loading.samplers")
 SHOWN = 3  # targets in a message

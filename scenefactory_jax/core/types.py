@@ -321,12 +321,25 @@ class Dynamics(NamedTuple):
     read: Callable[[Any], Motion]
 
 
+class PastPolicies(NamedTuple):
+    """Where background traffic is driven by past policies of a training, whose parameters are arguments of its compiled functions.
+
+    `bind` gives the traffic, or the environment, that has them: (parameters along the first axis, which of them there are yet) -> it. The
+    traffic without them has no past policies; its states are other ones.
+    """
+
+    slots: int  # policies that are kept
+    every: int  # iterations after which the newest replaces the oldest
+    bind: Callable[[Any, Bool[Array, " P"]], Any]
+
+
 class Traffic(NamedTuple):
     """Background traffic of one world: its own state, what moves it by one control step, and its boxes on the road."""
 
     init: Callable[[PRNGKeyArray, Scene, Int[Array, ""]], Any]  # (key, scene, control step) -> state
     advance: Callable[[Scene, Any, Boxes, Int[Array, ""]], Any]  # (scene, state, active agents, control step) -> state one step later
     read: Callable[[Scene, Any, Int[Array, ""]], Boxes]  # (scene, state, control step) -> its boxes
+    past: PastPolicies | None = None
 
 
 class Env(NamedTuple):
@@ -349,6 +362,7 @@ class Env(NamedTuple):
     observe: Callable[[Scene, State], Observation]
     current_scene: Callable[[Scene, State], Scene]
     action_repeat: int = 1
+    past: PastPolicies | None = None  # of the background traffic; a training binds them
 
 
 class Policy(NamedTuple):

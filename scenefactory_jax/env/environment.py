@@ -149,7 +149,7 @@ def make_parts(config: Mapping[str, Any]) -> EnvParts:
         action_repeat=read.actions.action_repeat,
         sample_agents=spawning.make(read.spawning.sampler),
         sample_weather=road_condition.make(read.weather),
-        traffic=traffic.make(read.traffic, friction=mu, **context),
+        traffic=traffic.make(read.traffic, friction=mu, config=config, **context),
         advance_route=functools.partial(route_following.advance, config=read.step_metrics.route),
         compute_metrics=functools.partial(step_metrics.compute, config=read.step_metrics, control_dt=context["control_dt"]),
         evaluate_termination=functools.partial(termination.evaluate, ending=read.termination.ending),
@@ -194,7 +194,9 @@ def assemble(parts: EnvParts) -> Env:
     def current_scene(scene: Scene, state: State) -> Scene:
         return _scene_at(parts, *_checked("env.current_scene", scene, state))
 
-    return Env(reset, step, init_state, control_step, observe, current_scene, parts.action_repeat)
+    given = parts.traffic.past
+    past = given and given._replace(bind=lambda *late: assemble(parts._replace(traffic=given.bind(*late))))
+    return Env(reset, step, init_state, control_step, observe, current_scene, parts.action_repeat, past)
 
 
 def _checked(where: str, scene: Scene, *rest: Any) -> tuple[Any, ...]:

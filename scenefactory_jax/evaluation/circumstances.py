@@ -19,6 +19,7 @@ TRAFFIC = {
     "idm_traffic": "vehicles with a route drive and react (IDM), people and cyclists as recorded",
     "trajectory_idm_traffic": "as recorded, some vehicles react along their tracks (MetaDrive's IDM)",
     "scenefactory_jax.learning.policy_traffic.policy_traffic": "vehicles that move drive by the policy {run}, all others as recorded",
+    "scenefactory_jax.learning.traffic_pool.pool_traffic": "one of {members} in each episode; past policies in training only",
     "mixed": "one kind of several in each episode",
 }
 
@@ -37,7 +38,8 @@ def describe(config: Mapping[str, Any]) -> dict[str, str]:
     if "traffic" in config:
         name = config["traffic"]["_target_"]
         run = Path(str(config["traffic"].get("run"))).name
-        labels["Background traffic"] = TRAFFIC[name].format(run=f"`{run}`") if name in TRAFFIC else f"`{name}`"
+        members = ", ".join(f"`{Path(member).name}`" for member in config["traffic"].get("members", []))
+        labels["Background traffic"] = TRAFFIC[name].format(run=f"`{run}`", members=members) if name in TRAFFIC else f"`{name}`"
     if "dynamics" in config:
         labels["Dynamics"] = _dynamics(config["dynamics"])
     if "timing" in config:

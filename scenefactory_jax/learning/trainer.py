@@ -45,6 +45,7 @@ class TrainState:
     steps: Int[Array, " 2"]  # steps of spawned slots so far: millions and the rest, since int32 ends at 2.1 billion
     learner: Any = ()  # what else the algorithm learns, on every device: critics, target networks
     buffer: Any = ()  # past samples or numbers of agents, with worlds or groups of them along the first axis, which the devices divide
+    past: Any = ()  # past policies that drive background traffic, see `past_policies`; every device has all of them
 
 
 class Trainer(NamedTuple):
@@ -134,8 +135,12 @@ def count_spawned_steps(train_state: TrainState) -> int:
 
 def get_policy_parameters(train_state: TrainState) -> Any:
     """The parameters to evaluate, on one device: the running mean, if there is one."""
-    parameters = train_state.parameters if train_state.ema_parameters is None else train_state.ema_parameters
-    return jax.tree.map(lambda leaf: leaf.addressable_data(0), parameters)
+    return jax.tree.map(lambda leaf: leaf.addressable_data(0), choose_parameters(train_state))
+
+
+def choose_parameters(train_state: TrainState) -> Any:
+    """The parameters to evaluate, as the train state has them."""
+    return train_state.parameters if train_state.ema_parameters is None else train_state.ema_parameters
 
 
 def restart(train_state: TrainState, scenes: Scene, *, env: Env, starts: int) -> TrainState:

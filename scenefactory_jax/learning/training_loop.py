@@ -18,7 +18,7 @@ from scenefactory_jax.core.instantiate import ConfigError, instantiate, resolve_
 from scenefactory_jax.core.types import Env, Policy, Scene
 from scenefactory_jax.data.loading import scene_source, stream
 from scenefactory_jax.env import environment
-from scenefactory_jax.learning import checkpoint, interrupt, run_folder
+from scenefactory_jax.learning import checkpoint, interrupt, past_policies, run_folder
 from scenefactory_jax.learning.networks import late_fusion
 from scenefactory_jax.learning.ppo import train_iteration as ppo
 from scenefactory_jax.learning.trainer import Trainer, TrainState, count_spawned_steps, get_policy_parameters
@@ -142,7 +142,9 @@ def make_trainer(config: Mapping[str, Any], env: Env, policy: Policy, *, mesh: M
     The entry `learner` names a function (config, env, policy, mesh=) -> Trainer, and has the numbers that it reads.
     """
     make = resolve_target(config["learner"]["_target_"], builtins=ppo, where="learner")
-    return make(config, env, policy, mesh=mesh)
+    if env.past is None:
+        return make(config, env, policy, mesh=mesh)
+    return past_policies.add_past_policies(lambda bound: make(config, bound, policy, mesh=mesh), env, policy, mesh=mesh)
 
 
 def _loop(

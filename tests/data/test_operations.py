@@ -327,6 +327,25 @@ def test_commands_write_views(town, tmp_path, capsys):
     assert sorted(path.name for path in tmp_path.iterdir()) == ["filtered", "merged", "parts"]  # without `out` nothing is written
 
 
+def test_other_cars_take_the_recording_cars_place(tmp_path, capsys):
+    raw = generated(7)
+    moves = lambda track, metres: np.hypot(*(track.xyz - track.xyz[0])[:, :2].T).max() >= metres  # noqa: E731
+    may = {track.id for track in raw.tracks if track.kind == "vehicle" and track.valid.all() and moves(track, 5.0)}
+    may -= {raw.tracks[raw.sdc].id}
+    assert 1 < len(may) < len(raw.tracks) - 1  # some may not
+    bank = banked(tmp_path / "one", [raw])
+    egos = command(bank, "op=egos", f"out={tmp_path / 'egos'}", "egos.count=null")
+    scenes_of = {raw.name: raw for raw in banks.read_raws(egos, range(len(egos)))}
+    assert set(scenes_of) == {raw.name, *(f"{raw.name}-{name}" for name in may)} and "from 1" in capsys.readouterr().out
+    assert all(one.tracks[one.sdc].id == name.removeprefix(f"{raw.name}-") for name, one in scenes_of.items() if name != raw.name)
+    nearest = command(bank, "op=egos", f"out={tmp_path / 'egos'}", "egos.count=1", "egos.keep_recording_car=false")
+    place = lambda one: one.tracks[one.sdc].xyz[one.current, :2]  # noqa: E731
+    away = {name: np.hypot(*(place(one) - place(raw))) for name, one in scenes_of.items() if name != raw.name}
+    assert list(nearest.names) == [min(away, key=away.get)]
+    with pytest.raises(ConfigError, match=r"out: expected a folder for the bank, got null"):
+        command(bank, "op=egos")
+
+
 @pytest.mark.parametrize(("name", "pattern"), [("gpudrive", "*.json"), ("scenarionet", "sd_*.pkl")])
 def test_what_is_exported_reads_back(town, tmp_path, name, pattern):
     assert command(town, "op=export", f"export.format={name}", f"out={tmp_path}") == 12

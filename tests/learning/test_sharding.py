@@ -43,13 +43,22 @@ def agree(one, other):
 @pytest.fixture(scope="module")
 def found():
     """(devices, shards) -> what was learnt."""
-    pairs = [(1, 4), (2, 4)]
-    return dict(zip(pairs, result(start(",".join(f"{devices}:{shards}" for devices, shards in pairs))), strict=True))
+    pairs = [(1, 4), (2, 4), (2, 4, 1)]
+    return dict(zip(pairs, result(start(",".join(":".join(map(str, pair)) for pair in pairs))), strict=True))
 
 
 def test_two_devices_learn_what_one_learns(found):
     assert found[2, 4]["devices"] == 4
     agree(found[2, 4], found[1, 4])
+
+
+def test_every_device_has_the_past_policies(found):
+    """And learning is what it is without them, where nothing drives by them."""
+    plain, past = found[2, 4], found[2, 4, 1]
+    metrics = [{name: value for name, value in row.items() if name != "past/policies"} for row in past["metrics"]]
+    agree(past | {"metrics": metrics}, plain)
+    assert [row["past/policies"] for row in past["metrics"]] == [2.0, 2.0, 2.0] and past["taken"] == [[2, 3]] * 2
+    np.testing.assert_array_equal(past["newest"], past["parameters"])
 
 
 def test_scenes_pass_through_worlds_without_compiling_again(found):

@@ -1,6 +1,8 @@
 """Runs in processes of its own: a few iterations of PPO on so many devices in so many shards; prints what was learnt as JSON.
 
-    python sharding.py DEVICES:SHARDS[,DEVICES:SHARDS ...] [COORDINATOR PROCESSES INDEX]
+    python sharding.py DEVICES:SHARDS[:PAST][,DEVICES:SHARDS ...] [COORDINATOR PROCESSES INDEX]
+
+PAST: of two past policies the newest replaces the oldest every so many iterations. The probe has no traffic that they would drive.
 """
 
 import itertools
@@ -15,18 +17,26 @@ if len(sys.argv) > 2:
 import numpy as np
 
 from scenefactory_jax.core import sharding
+from scenefactory_jax.core.types import PastPolicies
+from scenefactory_jax.learning import past_policies
+from scenefactory_jax.learning.networks import late_fusion
 from scenefactory_jax.learning.trainer import get_policy_parameters
-from support.probes import make_trainer, probe, scenes
+from support.probes import SMALL, make_trainer, probe, scenes
 
 WORLDS = 8
 COMPILED = ("jit(train_iteration)", "jit(replace_scenes)")
 
 
-def learn(devices, shards):
+def learn(devices, shards, every=None):
     """Parameters and metrics after three iterations, other scenes in half of the worlds between them; and what was compiled."""
     mesh = sharding.make_mesh(devices)
     numbers = {"desired_kl": 0.01, "stagger_episodes": True, "sample_fraction": 0.75, "shards": shards}
-    trainer = make_trainer(probe(life=5, episode_steps=6), episode_steps=6, mesh=mesh, **numbers)
+    env, make = probe(life=5, episode_steps=6), lambda env: make_trainer(env, episode_steps=6, mesh=mesh, **numbers)
+    if every is None:
+        trainer = make(env)
+    else:
+        bound = env._replace(past=PastPolicies(2, every, lambda *past: env))
+        trainer = past_policies.add_past_policies(make, bound, late_fusion.make(**SMALL), mesh=mesh)
     stage = sharding.place_on_devices(jax.tree.map(np.asarray, scenes(WORLDS)), mesh)
     fresh = sharding.place_on_devices(jax.tree.map(np.asarray, scenes(WORLDS // 2, task=2)), mesh)
     compiled, history = [], []
@@ -45,6 +55,10 @@ def learn(devices, shards):
     jax.monitoring.unregister_event_duration_listener(note)
     found = {"record": np.asarray(state.scene_stats.episodes).tolist(), "compiled": [name for name in compiled if name in COMPILED]}
     state = trainer.restart(state, stage)
+    if every is not None:
+        found["taken"] = [np.asarray(shard.data).tolist() for shard in state.past.iteration.addressable_shards]
+        newest = jax.tree.map(lambda kept: kept[int(np.argmax(found["taken"][0]))], jax.device_get(state.past.parameters))
+        found["newest"] = [*itertools.chain(*(np.ravel(leaf).tolist() for leaf in jax.tree.leaves(newest)))]
     learnt = [np.asarray(leaf).ravel().tolist() for leaf in jax.tree.leaves(get_policy_parameters(state))]
     found |= {"devices": len(jax.devices()), "processes": jax.process_count()}
     return {"parameters": [*itertools.chain(*learnt)], "metrics": history, **found}

@@ -7,6 +7,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Int, PRNGKeyArray
 
 from scenefactory_jax.core.pytree import replace
+from scenefactory_jax.core.schema import ConfigError
 from scenefactory_jax.core.types import Boxes, Scene, Traffic
 
 
@@ -18,7 +19,13 @@ class MixedState(NamedTuple):
 
 
 def mix_traffic(parts: list[Traffic], weights: list[float]) -> Traffic:
-    """Joins kinds of traffic to one that draws a part at each reset, in proportion to the weights."""
+    """Joins kinds of traffic to one that draws a part at each reset, in proportion to the weights.
+
+    Raises:
+        ConfigError: a part with past policies, which a training could not bind.
+    """
+    if any(part.past is not None for part in parts):
+        raise ConfigError("traffic: expected past policies as a member of traffic=pool, got them in a part of it or of traffic=mixed")
 
     def init(key: PRNGKeyArray, scene: Scene, step: Int[Array, ""]) -> MixedState:
         choice_key, key = jax.random.split(key)
