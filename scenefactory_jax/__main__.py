@@ -13,6 +13,7 @@ from scenefactory_jax.core.instantiate import ConfigError
 
 COMMANDS = {  # name -> purpose, and the keys to begin with
     "train": ("Train a policy.", "experiment=demo|quick|paper|smoke scenes=womd scenes.path=FOLDER"),
+    "record": ("Record an expert's samples for imitation.", "out=FOLDER spawning=logged scenes.path=FOLDER"),
     "evaluate": ("Evaluate a policy on held-out scenes.", "run=RUN scenes.path=FOLDER protocol=recorded|paper|strict|trained"),
     "compare": ("Compare training runs.", "runs='[runs/A-*,runs/B]' out=FOLDER"),
     "export": ("Export a policy to one small folder.", "run=RUN out=FOLDER"),

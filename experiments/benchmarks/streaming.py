@@ -11,7 +11,7 @@ from scenefactory_jax.core.instantiate import ConfigError
 from scenefactory_jax.data.loading import stream
 from scenefactory_jax.env import environment
 from scenefactory_jax.learning import phase_timing
-from scenefactory_jax.learning.training_loop import make_policy, make_trainer, step
+from scenefactory_jax.learning.training_loop import Streams, make_policy, make_trainer, step
 
 
 def measure(config: Mapping[str, Any], *, mesh: Mesh | None) -> dict[str, Any]:
@@ -27,17 +27,17 @@ def measure(config: Mapping[str, Any], *, mesh: Mesh | None) -> dict[str, Any]:
         raise ConfigError(f"stream: scenes are exchanged while training; scope={config['scope']} has stream=none")
     trainer = make_trainer(config, environment.make_env(config), make_policy(config), mesh=mesh)
     with stream.open_stream(config, mesh=mesh, before=None) as flow:
-        scenes = flow.scenes()
+        scenes, streams = flow.scenes(), Streams(flow, None)
         state = trainer.init(jax.random.key(config["seed"]), scenes)
         begun = time.perf_counter()
         compiled: Any = trainer.train_iteration.lower(state, scenes).compile()  # pyright: ignore[reportFunctionMemberAccess]
         trainer = trainer._replace(train_iteration=compiled)
-        state, scenes, _ = step(trainer, state, scenes, flow, first=True)
-        state, scenes, _ = step(trainer, state, scenes, flow, first=False)  # compiles the exchange
+        state, scenes, _ = step(trainer, state, scenes, streams, first=True)
+        state, scenes, _ = step(trainer, state, scenes, streams, first=False)  # compiles the exchange
         compile_s, seconds, rows = time.perf_counter() - begun, [], []
         for repeat in range(config["warmup"] + config["repeats"]):
             begun = time.perf_counter()
-            state, scenes, row = step(trainer, state, scenes, flow, first=False)
+            state, scenes, row = step(trainer, state, scenes, streams, first=False)
             if repeat >= config["warmup"]:
                 seconds.append(time.perf_counter() - begun)
                 rows.append(row)

@@ -115,6 +115,27 @@ class Train(Task):
 
 
 @dataclass(frozen=True)
+class Record(Task):
+    """The command `record`; what follows `stream` is not read, so that experiments apply."""
+
+    out: str | None
+    seed: Seed
+    worlds: Count
+    samples: Group
+    scenes: Group
+    learner: Group
+    stream: Group
+    policy: Any
+    ppo: Any
+    name: Any
+    iterations: Any
+    minutes: Any
+    checkpoint_every: Any
+    loggers: Any
+    evaluation: Any
+
+
+@dataclass(frozen=True)
 class Card:
     """README.md of an exported policy."""
 

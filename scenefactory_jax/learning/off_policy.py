@@ -25,7 +25,7 @@ from scenefactory_jax.core.schema import ConfigError, Count, Positive
 from scenefactory_jax.core.types import Env, Observation, Policy, Scene
 from scenefactory_jax.learning import replay_buffer, rollout, trainer
 from scenefactory_jax.learning.replay_buffer import Buffer, Storage
-from scenefactory_jax.learning.rollout import Act, Counts, Outcome, SceneStats, Transition, Worlds
+from scenefactory_jax.learning.rollout import Act, Counts, Disturb, Outcome, SceneStats, Transition, Worlds
 from scenefactory_jax.learning.trainer import Metrics, Trainer, TrainState
 
 T = TypeVar("T")
@@ -73,10 +73,11 @@ class Learner(NamedTuple):
     """An algorithm as functions."""
 
     init: Callable[[PRNGKeyArray, Any, Observation], Learnt]  # (key, parameters of the policy, observation of all worlds)
-    act: Callable[[Learnt], Act]
+    act: Callable[[Learnt], Act] | None  # None: worlds stand still, and recorded samples fill the buffer
     make_rows: Callable[[Transition], tuple[Any, Bool[Array, "T W A"]]]  # what is stored of transitions, and which of it
     update: Callable[[Learnt, Any, Float[Array, "G B"], PRNGKeyArray], tuple[Learnt, Metrics]]  # (learnt, rows, weight, key); the metrics
     # have `changed`, whether the update was finite
+    disturb: Disturb | None = None  # what becomes of the actions before they are made
 
 
 class Rounds(NamedTuple):
@@ -104,22 +105,33 @@ def run_rounds(
     rounds: Rounds, learnt: Learnt, buffer: Buffer, worlds: Worlds, scenes: Scene, key: PRNGKeyArray
 ) -> tuple[Learnt, Buffer, Worlds, Progress]:
     """Runs the rounds of an iteration."""
-    config, learner, axis = rounds.config, rounds.learner, rounds.axis
+    config = rounds.config
 
     def run(carry: tuple, key: PRNGKeyArray) -> tuple[tuple, Progress]:
         learnt, buffer, worlds = carry
         act_key, update_key = jax.random.split(key)
-        worlds, transitions, counts, scene_stats = rollout.collect_transitions(
-            rounds.env, learner.act(learnt), scenes, worlds, act_key, steps=config.unroll, axis=axis
-        )
-        rows, valid = learner.make_rows(transitions)
-        counts["stored"], counts["lost"] = jnp.sum(valid), jnp.sum(transitions.known & transitions.outcome.active & ~valid)
-        buffer = replay_buffer.insert(buffer, rows, valid)
+        worlds, buffer, counts, scene_stats = collect(rounds, learnt, buffer, worlds, scenes, act_key)
         learnt, sums = make_updates(rounds, learnt, buffer, update_key)
         return (learnt, buffer, worlds), Progress(sums, counts, scene_stats)
 
     carry, progress = jax.lax.scan(run, (learnt, buffer, worlds), jax.random.split(key, config.horizon // config.unroll))
     return *carry, jax.tree.map(lambda leaf: jnp.sum(leaf, axis=0), progress)
+
+
+def collect(
+    rounds: Rounds, learnt: Learnt, buffer: Buffer, worlds: Worlds, scenes: Scene, key: PRNGKeyArray
+) -> tuple[Worlds, Buffer, Counts, SceneStats]:
+    """Acts in all worlds and stores the samples; without an actor nothing moves."""
+    learner = rounds.learner
+    if learner.act is None:
+        zero = jnp.int32(0)
+        return worlds, buffer, {"spawned": zero, "stored": zero, "lost": zero}, rollout.make_empty_scene_stats(worlds.state)
+    worlds, transitions, counts, scene_stats = rollout.collect_transitions(
+        rounds.env, learner.act(learnt), scenes, worlds, key, steps=rounds.config.unroll, disturb=learner.disturb, axis=rounds.axis
+    )
+    rows, valid = learner.make_rows(transitions)
+    counts["stored"], counts["lost"] = jnp.sum(valid), jnp.sum(transitions.known & transitions.outcome.active & ~valid)
+    return worlds, replay_buffer.insert(buffer, rows, valid), counts, scene_stats
 
 
 def make_updates(rounds: Rounds, learnt: Learnt, buffer: Buffer, key: PRNGKeyArray) -> tuple[Learnt, Metrics]:
@@ -222,7 +234,8 @@ def train_iteration(rounds: Rounds, train_state: TrainState, scenes: Scene) -> t
     updates = progress.sums["changed"] + progress.sums["skipped"]
     steps = {"steps/updates": updates, "steps/samples": updates * rounds.config.batch}
     metrics = {f"{name}/{part}": value for part, value in compute_metrics(rounds, progress.sums, counts, buffer).items()}
-    return to_strong_type(train_state), rollout.compute_rollout_metrics(counts) | metrics | steps
+    steps |= {"steps/spawned": jnp.float32(0.0)} if rounds.learner.act is None else rollout.compute_rollout_metrics(counts)
+    return to_strong_type(train_state), steps | metrics
 
 
 def compute_metrics(rounds: Rounds, sums: Metrics, counts: Counts, buffer: Buffer) -> Metrics:
@@ -312,4 +325,5 @@ def make_trainer(rounds: Rounds, policy: Policy, *, episode_steps: int, mesh: Me
     """Builds the trainer of a single learner; `episode_steps` and `mesh` as of PPO."""
     starts = count_starts(rounds.env, rounds.config, episode_steps=episode_steps)
     init = functools.partial(init_train_state, [rounds], policy=policy, starts=starts)
-    return trainer.compile_trainer(init, functools.partial(train_iteration, rounds), rounds.env, starts=starts, mesh=mesh)
+    iterate, recorded = functools.partial(train_iteration, rounds), rounds.name if rounds.learner.act is None else None
+    return trainer.compile_trainer(init, iterate, rounds.env, starts=starts, mesh=mesh, recorded=recorded)

@@ -70,7 +70,7 @@ class Transition:
     """One action of every slot, with what was observed before and after it."""
 
     observation: Observation
-    action: Float[Array, "W A 3"]
+    action: Float[Array, "W A 3"]  # that was chosen
     known: Bool[Array, "W A"]  # the action is one to learn from
     next_observation: Observation  # of another episode, where this one ended
     outcome: Outcome
@@ -78,6 +78,9 @@ class Transition:
 
 Act = Callable[[Scene, Worlds, PRNGKeyArray], tuple[Float[Array, "W A 3"], Bool[Array, "W A"]]]
 """(scenes, worlds, key) -> actions, and a mask of those that are one to learn from."""
+
+Disturb = Callable[[Worlds, Float[Array, "W A 3"]], Float[Array, "W A 3"]]
+"""(worlds, chosen actions) -> actions that are made in their place."""
 
 Counts = dict[str, Array]
 """Sums over worlds, agents and time, from which metrics are computed."""
@@ -109,14 +112,26 @@ def collect_rollout(
 
 
 def collect_transitions(
-    env: Env, act: Act, scenes: Scene, worlds: Worlds, key: PRNGKeyArray, *, steps: int, axis: str | None = None
+    env: Env,
+    act: Act,
+    scenes: Scene,
+    worlds: Worlds,
+    key: PRNGKeyArray,
+    *,
+    steps: int,
+    disturb: Disturb | None = None,
+    axis: str | None = None,
 ) -> tuple[Worlds, Transition, Counts, SceneStats]:
-    """Acts `steps` times in `W` worlds, as `collect_rollout`, and returns transitions `[T, W, A]` in place of samples."""
+    """Acts `steps` times in `W` worlds, as `collect_rollout`, and returns transitions `[T, W, A]` in place of samples.
+
+    Transitions have the actions that were chosen, whatever `disturb` made of them.
+    """
 
     def step(worlds: Worlds, key: PRNGKeyArray) -> tuple[Worlds, tuple[Transition, Counts]]:
         action_key, start_key = jax.random.split(key)
         action, known = act(scenes, worlds, action_key)
-        after, outcome, counts = step_worlds(env, scenes, worlds, action, start_key, axis=axis)
+        made = action if disturb is None else disturb(worlds, action)
+        after, outcome, counts = step_worlds(env, scenes, worlds, made, start_key, axis=axis)
         return after, (Transition(worlds.observation, action, known, after.observation, outcome), counts)
 
     worlds, (transitions, counts) = jax.lax.scan(step, worlds, jax.random.split(key, steps))

@@ -7,6 +7,7 @@ device; `compile_trainer` makes a `Trainer` of them, on one device or on a mesh.
     train_state = trainer.init(key, scenes)                                   # scenes: worlds stacked along the first axis
     train_state, metrics = trainer.train_iteration(train_state, scenes)       # `train_state` is donated: use the returned one
     train_state, scenes = trainer.replace_scenes(train_state, scenes, rows, new)    # other scenes in some worlds; both are donated
+    train_state = trainer.put_samples(train_state, rows, valid)               # recorded samples, where a buffer is for these
 
 Scenes are an argument of the compiled functions, never a constant in them.
 """
@@ -19,11 +20,12 @@ import jax
 import jax.numpy as jnp
 import optax
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
-from jaxtyping import Array, Float, Int, Key, PRNGKeyArray
+from jaxtyping import Array, Bool, Float, Int, Key, PRNGKeyArray
 
 from scenefactory_jax.core import sharding
 from scenefactory_jax.core.pytree import pytree_dataclass, replace, to_strong_type
 from scenefactory_jax.core.types import Env, Observation, Policy, Scene
+from scenefactory_jax.learning import replay_buffer
 from scenefactory_jax.learning.rollout import SceneStats, Worlds, make_empty_episode_stats, make_empty_scene_stats
 
 Metrics = dict[str, Float[Array, ""]]
@@ -53,12 +55,16 @@ class Trainer(NamedTuple):
 
     `restart` starts new episodes in other scenes and keeps what was learnt. `replace_scenes` does so in some worlds and leaves the others
     as they are: (train state, scenes, distinct indices of worlds, as many scenes of the same sizes) -> (train state, scenes).
+    `put_samples` writes the valid rows `[M, ...]` over the oldest ones of the buffer `recorded`, the first M / G of them in the first of
+    its G groups; the train state is donated.
     """
 
     init: Callable[[PRNGKeyArray, Scene], TrainState]
     train_iteration: Callable[[TrainState, Scene], tuple[TrainState, Metrics]]
     restart: Callable[[TrainState, Scene], TrainState]
     replace_scenes: Callable[[TrainState, Scene, Int[Array, " N"], Scene], tuple[TrainState, Scene]]
+    put_samples: Callable[[TrainState, Any, Bool[Array, " M"]], TrainState]
+    recorded: str | None  # name of the buffer that recorded samples fill; None: there is none
 
 
 def split_key(key: PRNGKeyArray) -> Array:
@@ -169,6 +175,12 @@ def put_scenes(
     return to_strong_type(replace(train_state, worlds=worlds, scene_stats=scene_stats, key=key)), scenes
 
 
+def put_samples(train_state: TrainState, rows: Any, valid: Bool[Array, " M"], *, name: str | None) -> TrainState:
+    """Writes the valid rows into the buffer of that name, on every device those of its groups."""
+    rows, valid = jax.tree.map(lambda leaf: leaf[None, :, None], (rows, valid))
+    return replace(train_state, buffer=train_state.buffer | {name: replay_buffer.insert(train_state.buffer[name], rows, valid)})
+
+
 def compile_trainer(
     init: Callable[[PRNGKeyArray, Scene], TrainState],
     iterate: Callable[[TrainState, Scene], tuple[TrainState, Metrics]],
@@ -176,12 +188,14 @@ def compile_trainer(
     *,
     starts: int,
     mesh: Mesh | None,
+    recorded: str | None = None,
 ) -> Trainer:
     """Compiles an algorithm's functions; on a mesh each device runs `iterate` on its own worlds.
 
     Args:
         starts: see `start_worlds`.
         mesh: of devices with the axis `sharding.AXIS`, along which worlds are divided; None: one device.
+        recorded: see `Trainer`.
     """
     swap = functools.partial(put_scenes, env=env, axis=None if mesh is None else sharding.AXIS)
     sharded, replicated = sharding.make_sharded_specs, sharding.make_replicated_specs
@@ -200,11 +214,17 @@ def compile_trainer(
         trees, in_specs = (train_state, scenes, rows, new), (_make_specs, sharded, replicated, replicated)
         return sharding.map_over_devices(swap, trees, in_specs, specs, mesh)
 
+    def put_recorded(train_state: TrainState, rows: Any, valid: Array) -> TrainState:
+        put, parts = functools.partial(put_samples, name=recorded), (_make_specs, sharded, sharded)
+        return sharding.map_over_devices(put, (train_state, rows, valid), parts, _make_specs, mesh)
+
     return Trainer(
         init=jax.jit(lambda key, scenes: place(init(key, scenes))),
         train_iteration=jax.jit(train_iteration, donate_argnums=0),
         restart=jax.jit(lambda train_state, scenes: place(restart(train_state, scenes, env=env, starts=starts)), donate_argnums=0),
         replace_scenes=jax.jit(replace_scenes, donate_argnums=(0, 1)),
+        put_samples=jax.jit(put_recorded, donate_argnums=0),
+        recorded=recorded,
     )
 
 

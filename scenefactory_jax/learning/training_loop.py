@@ -18,9 +18,10 @@ from scenefactory_jax.core.instantiate import ConfigError, instantiate, resolve_
 from scenefactory_jax.core.types import Env, Policy, Scene
 from scenefactory_jax.data.loading import scene_source, stream
 from scenefactory_jax.env import environment
-from scenefactory_jax.learning import checkpoint, interrupt, past_policies, run_folder
+from scenefactory_jax.learning import checkpoint, interrupt, past_policies, run_folder, sample_stream
 from scenefactory_jax.learning.networks import late_fusion
 from scenefactory_jax.learning.ppo import train_iteration as ppo
+from scenefactory_jax.learning.sample_stream import SampleStream
 from scenefactory_jax.learning.trainer import Trainer, TrainState, count_spawned_steps, get_policy_parameters
 from scenefactory_jax.loggers import metrics_csv
 
@@ -40,6 +41,18 @@ class Prepared(NamedTuple):
     mesh: Mesh | None
     trainer: Trainer
     scenes: scene_source.Scenes | None = None
+
+
+class Streams(NamedTuple):
+    """What comes from the disk while a run trains; None: nothing of the kind."""
+
+    scenes: stream.SceneStream | None
+    samples: SampleStream | None
+
+    def state(self) -> dict[str, Any] | None:
+        """All that the next scenes and samples depend on, as JSON values."""
+        state = {} if self.scenes is None else self.scenes.state()
+        return state | ({} if self.samples is None else {"samples": self.samples.state()}) or None
 
 
 class Run(NamedTuple):
@@ -86,17 +99,22 @@ def train(
     scene_source.use_compilation_cache()
     prepared = prepared or prepare(config)
     with run_folder.open_run_folder(config) as (folder, resume):
-        with _open_scenes(config, folder, prepared, resume=resume) as (worlds, flow):
+        with contextlib.ExitStack() as stack:
+            before = checkpoint.restore_host(folder / "checkpoints") if resume else None
+            worlds, flow = stack.enter_context(_open_scenes(config, folder, prepared, before))
             state = prepared.trainer.init(jax.random.key(config["seed"]), worlds)
             if resume:
                 state = checkpoint.restore(folder / "checkpoints", state)
                 LOG.info(f"resumed at iteration {int(state.iteration)}")
+            before = before and before.get("samples")
+            samples = stack.enter_context(sample_stream.open_stream(config, prepared.trainer, state, mesh=prepared.mesh, before=before))
             first = int(state.iteration) if resume else None
             configs.write(folder, config)  # once scenes and checkpoint are read: a failed start leaves no config
             callbacks = [on_iteration] if on_iteration else []
             if callback := make_callback and make_callback(folder, first):
                 callbacks.insert(0, lambda state, row: callback(get_policy_parameters(state), row))
-            state = _loop(config, folder, prepared.trainer, worlds, state, flow, watching, first=first, callbacks=callbacks)
+            streams = Streams(flow, samples)
+            state = _loop(config, folder, prepared.trainer, worlds, state, streams, watching, first=first, callbacks=callbacks)
         if finish is not None:
             finish(folder)
     return Run(folder, config, prepared.env, prepared.policy, state, metrics_csv.read(folder))
@@ -104,7 +122,7 @@ def train(
 
 @contextlib.contextmanager
 def _open_scenes(
-    config: Mapping[str, Any], folder: Path, prepared: Prepared, *, resume: bool
+    config: Mapping[str, Any], folder: Path, prepared: Prepared, before: Mapping[str, Any] | None
 ) -> Iterator[tuple[Scene, stream.SceneStream | None]]:
     """Loads the scenes of all worlds onto their devices; the second value is the stream of further scenes, if there is one."""
     if config["stream"] is None:
@@ -116,7 +134,6 @@ def _open_scenes(
         LOG.info(f"run {folder}\n{loaded.account}\n{chosen}")
         yield worlds, None
         return
-    before = checkpoint.restore_host(folder / "checkpoints") if resume else None
     with stream.open_stream(config, mesh=prepared.mesh, before=before) as flow:
         worlds = flow.scenes()
         LOG.info(f"run {folder}")
@@ -153,7 +170,7 @@ def _loop(
     trainer: Trainer,
     worlds: Scene,
     state: TrainState,
-    flow: stream.SceneStream | None,
+    streams: Streams,
     watching: Mapping[str, loggers.Logger],
     *,
     first: int | None,
@@ -177,7 +194,7 @@ def _loop(
     ):
         for iteration in range(start + 1, total + 1):
             before = time.monotonic()
-            state, worlds, row = step(trainer, state, worlds, flow, first=iteration == 1)
+            state, worlds, row = step(trainer, state, worlds, streams, first=iteration == 1)
             seconds = time.monotonic() - before
             spent += seconds / 60
             row = {"iteration": iteration, "minutes": spent, "steps/total": count_spawned_steps(state), **row, "seconds": seconds}
@@ -191,8 +208,7 @@ def _loop(
                 callback(state, row)
             late, stop = config["minutes"] is not None and spent >= config["minutes"], get_signal()
             if late or stop or iteration == total or iteration % config["checkpoint_every"] == 0:
-                host = None if flow is None else flow.state()
-                checkpoint.save(folder / "checkpoints", state, keep=config["checkpoints_kept"], host=host)
+                checkpoint.save(folder / "checkpoints", state, keep=config["checkpoints_kept"], host=streams.state())
             if stop:
                 interrupt.end(folder, iteration, stop)
             if late:
@@ -224,9 +240,12 @@ def _find_unusable(row: Mapping[str, float | int]) -> list[str]:
 
 
 def step(
-    trainer: Trainer, state: TrainState, worlds: Scene, flow: stream.SceneStream | None, *, first: bool
+    trainer: Trainer, state: TrainState, worlds: Scene, streams: Streams, *, first: bool
 ) -> tuple[TrainState, Scene, dict[str, float | int]]:
-    """Makes one iteration, with the stream's next scenes in some worlds if there is a stream; gives its metrics on the host."""
+    """Makes one iteration, with the streams' next scenes in some worlds and next samples; gives its metrics on the host."""
+    flow, samples = streams
+    if samples is not None:
+        state = samples.exchange(trainer.put_samples, state)
     if flow is not None and not first:
         state, worlds = flow.exchange(trainer.replace_scenes, state, worlds)
     state, metrics = trainer.train_iteration(state, worlds)
@@ -241,4 +260,5 @@ def describe(row: Mapping[str, float | int]) -> str:
     """Describes a row of metrics in one line."""
     names = {"goal_reached": "goal", "collision": "collision", "road_edge_contact": "edge", "out_of_bounds": "crash"}
     rates = " ".join(f"{label} {100 * row[f'events/{name}']:.0f}%" for name, label in names.items() if f"events/{name}" in row)
-    return f"{rates} | {row['casps']:,.0f} steps/s"
+    speed = f"{row['casps']:,.0f} steps/s" if row["casps"] else f"{row.get('samples_per_s', 0.0):,.0f} samples/s"
+    return f"{rates} | {speed}"

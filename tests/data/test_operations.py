@@ -337,7 +337,7 @@ def test_other_cars_take_the_recording_cars_place(tmp_path, capsys):
     egos = command(bank, "op=egos", f"out={tmp_path / 'egos'}", "egos.count=null")
     scenes_of = {raw.name: raw for raw in banks.read_raws(egos, range(len(egos)))}
     assert set(scenes_of) == {raw.name, *(f"{raw.name}-{name}" for name in may)} and "from 1" in capsys.readouterr().out
-    assert all(one.tracks[one.sdc].id == name.removeprefix(f"{raw.name}-") for name, one in scenes_of.items() if name != raw.name)
+    assert all(str(one.tracks[one.sdc].id) == name.removeprefix(f"{raw.name}-") for name, one in scenes_of.items() if name != raw.name)
     nearest = command(bank, "op=egos", f"out={tmp_path / 'egos'}", "egos.count=1", "egos.keep_recording_car=false")
     place = lambda one: one.tracks[one.sdc].xyz[one.current, :2]  # noqa: E731
     away = {name: np.hypot(*(place(one) - place(raw))) for name, one in scenes_of.items() if name != raw.name}

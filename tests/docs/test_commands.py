@@ -90,7 +90,7 @@ def test_a_command_of_the_pages_runs(desk, line):
     if any(word.startswith("hydra/launcher") for word in words):
         pytest.importorskip("hydra_plugins.hydra_joblib_launcher", reason="needs the launcher: pip install scenefactory_jax[sweeps]")
     words = [SHORTER.get(word, word) for word in words]
-    if command in ("train", "benchmark") and not any(word.startswith("experiment=") for word in words):
+    if command in ("train", "record", "benchmark") and not any(word.startswith("experiment=") for word in words):
         words.append("experiment=smoke")
     words += SMALL.get(command, [])
     done = shell(desk, command, *words, **QUICKLY)

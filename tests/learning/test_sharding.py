@@ -114,6 +114,14 @@ def test_coordinated_policies_learn_the_same_on_two_devices():
     assert one["metrics"] == pytest.approx(both["metrics"], rel=1e-3, abs=1e-4)
 
 
+@pytest.mark.slow  # as the learners off policy, but for the chunk
+def test_recorded_samples_are_divided_among_two_devices():
+    one, both = result(start("recorded", visible=2, module="support.learner_sharding"))
+    assert (one["parts"], both["parts"]) == (1, 2) and one["filled"] == both["filled"] == [30, 30]
+    assert one["rows"] == both["rows"] and one["rows"][0][1][0] > one["rows"][1][0][0] > one["rows"][0][0][0]  # in turn
+    assert one["metrics"] == pytest.approx(both["metrics"], rel=1e-3, abs=1e-4)
+
+
 def test_mistakes_are_named():
     with pytest.raises(ConfigError, match=r"ppo\.shards: expected a multiple of 1 devices, got 0"):
         make_trainer(probe(), shards=0)

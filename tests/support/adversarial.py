@@ -22,6 +22,7 @@ NUMBERS = dict(
     passes=2,
     batch=64,
     expert={},
+    samples=None,
     expert_every=2,
     expert_steps=16,
     buffer=512,
@@ -50,9 +51,9 @@ def remembering_probe():
     return probe(life=3)._replace(observe=observe)
 
 
-def make_learner(name, *, mesh=None, shards=None, **changes):
+def make_learner(name, *, mesh=None, shards=None, env=None, expert=expert, **changes):
     numbers = ppo_config(learning_rate=1e-2, gamma=GAMMA, shards=shards)
-    judge, env = make_discriminator(name), remembering_probe()
+    judge, env = make_discriminator(name), env or remembering_probe()
     return train_iteration.make_trainer(
         name, env, POLICY, judge, numbers, make_numbers(**changes), expert, numbers=2, episode_steps=1000, mesh=mesh
     )

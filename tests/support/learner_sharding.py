@@ -7,6 +7,7 @@ import jax
 import numpy as np
 
 from scenefactory_jax.core import sharding
+from scenefactory_jax.learning import sample_stream
 from scenefactory_jax.learning.trainer import get_policy_parameters
 from support.probes import make_learner, probe, scenes
 
@@ -31,5 +32,26 @@ def learn(name, devices):
     }
 
 
+def fill(name, devices):
+    """Rows and metrics of a learner from recorded samples, after a chunk of 60 samples, 30 in each group, and an iteration."""
+    mesh = sharding.make_mesh(devices)
+    _, trainer = make_learner("bc", probe(), mesh=mesh, shards=2, samples="there")
+    stage = sharding.place_on_devices(jax.tree.map(np.asarray, scenes(8)), mesh)
+    state = trainer.init(jax.random.key(3), stage)
+    cue = np.linspace(-1, 1, 60, dtype=np.float32)[:, None]
+    arrays = sample_stream.divide({"cue": cue, "action": np.concatenate([cue, -cue], axis=1)}, 2, size=32)
+    chunk = {"observation": {"cue": arrays["cue"]}, "action": arrays["action"]}, arrays[sample_stream.VALID]
+    state = trainer.put_samples(state, *sharding.place_on_devices(chunk, mesh))
+    state, metrics = trainer.train_iteration(state, stage)
+    buffer = state.buffer["bc"]
+    return {
+        "rows": np.asarray(buffer.rows["action"]).tolist(),
+        "filled": np.asarray(buffer.filled).tolist(),
+        "metrics": {name: float(value) for name, value in metrics.items()},
+        "parts": len(buffer.filled.addressable_shards),
+    }
+
+
 if __name__ == "__main__":
-    print("RESULT", json.dumps([learn(name, devices) for name in sys.argv[1].split(",") for devices in (1, 2)]), flush=True)
+    task = fill if sys.argv[1] == "recorded" else learn
+    print("RESULT", json.dumps([task(name, devices) for name in sys.argv[1].split(",") for devices in (1, 2)]), flush=True)

@@ -75,16 +75,18 @@ REPLAY = dict(
 )
 CRITICS = dict(learning_rate=1e-2, critic_learning_rate=1e-2, gamma=0.9, tau=0.05)
 SOFT = dict(actor="tanh_gaussian", alpha=0.01, entropy_target=None, alpha_learning_rate=1e-2)
+EXPERT = dict(expert={}, expert_noise=dict(std=[0.0, 0.0, 0.0], time_s=1.0, part=0.0), samples=None)
 LEARNERS = {
     "sac": REPLAY | CRITICS | SOFT,
     "td3": REPLAY
     | CRITICS
     | dict(actor="deterministic", learning_rate=3e-3, exploration_std=0.3, target_noise_std=0.1, target_noise_clip=0.2, policy_delay=2),
-    "bc": REPLAY | dict(actor="tanh_gaussian", learning_rate=1e-2, loss="squared_error", expert={}),
+    "bc": REPLAY | EXPERT | dict(actor="tanh_gaussian", learning_rate=1e-2, loss="squared_error"),
     "bc_sac": REPLAY
     | CRITICS
     | SOFT
-    | dict(imitation_every=2, imitation_learning_rate=1e-2, imitation_loss="squared_error", expert={}, expert_buffer=256),
+    | EXPERT
+    | dict(imitation_every=2, imitation_learning_rate=1e-2, imitation_loss="squared_error", expert_buffer=256),
 }
 STEERS = 0.3  # action of the probes' expert that no reward asks for
 
@@ -119,7 +121,7 @@ def make_learner(name: str, env: Env, *, mesh=None, episode_steps: int = 1000, a
     [kind] = (value for key, value in vars(config).items() if key.lower() == f"{name.replace('_', '')}config")
     numbers = schema.read({**LEARNERS[name], **changes}, kind, where="learner")
     policy = late_fusion.make(**SMALL, actor=numbers.actor, numbers=actions)
-    experts = [expert] if name.startswith("bc") else []
+    experts = [None if changes.get("samples") else expert] if name.startswith("bc") else []
     return policy, module.make_trainer(env, policy, numbers, *experts, episode_steps=episode_steps, mesh=mesh)
 
 

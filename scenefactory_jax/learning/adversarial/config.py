@@ -18,6 +18,7 @@ class AdversarialConfig:
     passes: Count  # over a rollout in an iteration
     batch: Count  # pairs of the policy in an update, of all devices, and as many of the expert
     expert: dict[str, Any]  # an entry of the group `policy`
+    samples: str | None  # folder that `record` wrote; None: the expert drives in the worlds
     expert_every: Count  # iterations, before the first of which the expert drives
     expert_steps: Count | None  # actions that it drives then, from the start of episodes; None: an episode's
     buffer: Count  # pairs of the expert that are kept, of all devices

@@ -46,7 +46,7 @@ class Imitation:
     name: str  # of the learner: its key in the train state, and the first part of its metrics' names
     ppo: PPO
     discriminator: Discriminator
-    expert: Act
+    expert: Act | None  # None: recorded samples fill the buffer
     config: AdversarialConfig
     numbers: int  # of an action that the environment reads
     expert_steps: int
@@ -63,9 +63,10 @@ def train_iteration(imitation: Imitation, train_state: TrainState, scenes: Scene
     ppo, name, config = imitation.ppo, imitation.name, imitation.config
     rollout_key, expert_key, judge_key, update_key, key = jax.random.split(train_state.key, 5)
     collected = ppo_iteration.collect(ppo, train_state, scenes, rollout_key)
-    drive = functools.partial(drive_expert, imitation, scenes, expert_key)
-    turn = train_state.iteration % config.expert_every == 0
-    buffer = jax.lax.cond(turn, drive, lambda buffer: buffer, train_state.buffer[name])
+    buffer = train_state.buffer[name]
+    if imitation.expert is not None:
+        drive = functools.partial(drive_expert, imitation, scenes, expert_key)
+        buffer = jax.lax.cond(train_state.iteration % config.expert_every == 0, drive, lambda buffer: buffer, buffer)
 
     pairs = make_policy_pairs(imitation, train_state.parameters, collected)
     learnt, metrics = update_discriminator(imitation, train_state, pairs, buffer, judge_key)
@@ -84,7 +85,8 @@ def drive_expert(imitation: Imitation, scenes: Scene, key: PRNGKeyArray, buffer:
 
     Of an episode that may not fit into the buffer a random part is stored, so that its end does not crowd out its start.
     """
-    env, axis, steps = imitation.ppo.env, imitation.ppo.axis, imitation.expert_steps
+    env, axis, steps, expert = imitation.ppo.env, imitation.ppo.axis, imitation.expert_steps, imitation.expert
+    assert expert is not None
     start_key, drive_key = jax.random.split(key)
     count = len(jax.tree.leaves(scenes)[0])
     worlds = trainer.start_each_world(env, sharding.world_keys(start_key, count, axis), scenes, starts=1)
@@ -94,7 +96,7 @@ def drive_expert(imitation: Imitation, scenes: Scene, key: PRNGKeyArray, buffer:
     def step(carry: tuple, key: PRNGKeyArray) -> tuple[tuple, None]:
         worlds, buffer = carry
         act_key, store_key = jax.random.split(key)
-        worlds, transitions, *_ = rollout.collect_transitions(env, imitation.expert, scenes, worlds, act_key, steps=1, axis=axis)
+        worlds, transitions, *_ = rollout.collect_transitions(env, expert, scenes, worlds, act_key, steps=1, axis=axis)
         rows, valid = make_rows(imitation, transitions)
         chance = jax.vmap(lambda key: jax.random.uniform(key, valid.shape[2:]))(sharding.world_keys(store_key, count, axis))
         return (worlds, replay_buffer.insert(buffer, rows, valid & (chance < part)[None])), None
@@ -210,13 +212,13 @@ def make_trainer(
     discriminator: Discriminator,
     ppo_config: PPOConfig,
     config: AdversarialConfig,
-    expert: Act,
+    expert: Act | None,
     *,
     numbers: int,
     episode_steps: int,
     mesh: Mesh | None = None,
 ) -> Trainer:
-    """Builds a trainer for one environment, one policy and one expert; arguments as of PPO.
+    """Builds a trainer for one environment, one policy and one expert (None: its samples are recorded); arguments as of PPO.
 
     Args:
         name: of the learner.
@@ -232,7 +234,8 @@ def make_trainer(
     devices, starts = shards // ppo.groups, actions if ppo_config.stagger_episodes else 1
     imitation = Imitation(name, ppo, discriminator, expert, config, numbers, config.expert_steps or actions, devices)
     iterate = functools.partial(train_iteration, imitation)
-    return trainer.compile_trainer(functools.partial(init, imitation, shards, starts), iterate, env, starts=starts, mesh=mesh)
+    begin, recorded = functools.partial(init, imitation, shards, starts), name if expert is None else None
+    return trainer.compile_trainer(begin, iterate, env, starts=starts, mesh=mesh, recorded=recorded)
 
 
 def make(

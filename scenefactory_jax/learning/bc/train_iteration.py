@@ -20,11 +20,11 @@ from scenefactory_jax.env import environment
 from scenefactory_jax.learning import off_policy, replay_buffer, rollout
 from scenefactory_jax.learning.bc import loss
 from scenefactory_jax.learning.bc.config import BCConfig
-from scenefactory_jax.learning.expert import make_expert
+from scenefactory_jax.learning.expert import make_disturbance, make_expert
 from scenefactory_jax.learning.networks import squashed
 from scenefactory_jax.learning.networks.squashed import Networks
 from scenefactory_jax.learning.off_policy import Learner, Learnt
-from scenefactory_jax.learning.rollout import Act, Transition
+from scenefactory_jax.learning.rollout import Act, Disturb, Transition
 from scenefactory_jax.learning.trainer import Metrics, Trainer
 
 
@@ -73,19 +73,30 @@ def update(bc: BC, learnt: Learnt, rows: dict[str, Any], weight: Float[Array, "G
     return off_policy.select(metrics["changed"], Learnt(parameters, (), state), learnt), metrics
 
 
-def make_learner(policy: Policy, config: BCConfig, expert: Act, axis: str | None) -> Learner:
-    """Binds the functions."""
+def make_learner(policy: Policy, config: BCConfig, expert: Act | None, disturb: Disturb | None, axis: str | None) -> Learner:
+    """Binds the functions; without an expert, recorded samples fill the buffer."""
     bc = BC(policy, config, axis)
-    return Learner(functools.partial(init, bc), lambda learnt: expert, functools.partial(make_rows, bc), functools.partial(update, bc))
+    act = None if expert is None else lambda learnt: expert
+    return Learner(functools.partial(init, bc), act, functools.partial(make_rows, bc), functools.partial(update, bc), disturb)
 
 
-def make_trainer(env: Env, policy: Policy, config: BCConfig, expert: Act, *, episode_steps: int, mesh: Mesh | None = None) -> Trainer:
-    """Builds a trainer for one environment, one policy and one expert; arguments as of PPO."""
-    rounds = off_policy.make_rounds("bc", env, make_learner(policy, config, expert, off_policy.get_axis(mesh)), config, mesh)
+def make_trainer(
+    env: Env,
+    policy: Policy,
+    config: BCConfig,
+    expert: Act | None,
+    *,
+    episode_steps: int,
+    disturb: Disturb | None = None,
+    mesh: Mesh | None = None,
+) -> Trainer:
+    """Builds a trainer for one environment, one policy and one expert (None: its samples are recorded); arguments as of PPO."""
+    rounds = off_policy.make_rounds("bc", env, make_learner(policy, config, expert, disturb, off_policy.get_axis(mesh)), config, mesh)
     return off_policy.make_trainer(rounds, policy, episode_steps=episode_steps, mesh=mesh)
 
 
 def make(config: Mapping[str, Any], env: Env, policy: Policy, *, mesh: Mesh | None = None) -> Trainer:
     """Builds the trainer of a config whose `learner` is BC."""
-    numbers, expert = off_policy.read_numbers(config, BCConfig), make_expert(config)
-    return make_trainer(env, policy, numbers, expert, episode_steps=environment.episode_steps(config["timing"]), mesh=mesh)
+    numbers, steps = off_policy.read_numbers(config, BCConfig), environment.episode_steps(config["timing"])
+    expert, disturb = make_expert(config), make_disturbance(numbers.expert_noise, config)
+    return make_trainer(env, policy, numbers, expert, episode_steps=steps, disturb=disturb, mesh=mesh)

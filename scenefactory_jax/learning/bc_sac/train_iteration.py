@@ -20,9 +20,9 @@ from scenefactory_jax.env import environment
 from scenefactory_jax.learning import off_policy, replay_buffer, trainer
 from scenefactory_jax.learning.bc import train_iteration as bc
 from scenefactory_jax.learning.bc_sac.config import BCSACConfig
-from scenefactory_jax.learning.expert import make_expert
+from scenefactory_jax.learning.expert import make_disturbance, make_expert
 from scenefactory_jax.learning.off_policy import Rounds
-from scenefactory_jax.learning.rollout import Act
+from scenefactory_jax.learning.rollout import Act, Disturb
 from scenefactory_jax.learning.sac import train_iteration as sac
 from scenefactory_jax.learning.trainer import Metrics, Trainer, TrainState
 
@@ -38,6 +38,8 @@ def train_iteration(
 
     @jax.jit
     def clone(train_state: TrainState) -> tuple[TrainState, Metrics]:
+        if cloning.learner.act is None:
+            return off_policy.train_iteration(cloning, train_state, scenes)
         before, after, key = jax.random.split(train_state.key, 3)
         train_state = start_anew(cloning, replace(train_state, key=key), scenes, before, starts=starts)
         train_state, metrics = off_policy.train_iteration(cloning, train_state, scenes)
@@ -66,19 +68,30 @@ def start_anew(rounds: Rounds, train_state: TrainState, scenes: Scene, key: PRNG
     return replace(train_state, worlds=trainer.start_each_world(rounds.env, keys, scenes, starts=starts))
 
 
-def make_trainer(env: Env, policy: Policy, config: BCSACConfig, expert: Act, *, episode_steps: int, mesh: Mesh | None = None) -> Trainer:
-    """Builds a trainer for one environment, one policy and one expert; arguments as of PPO."""
+def make_trainer(
+    env: Env,
+    policy: Policy,
+    config: BCSACConfig,
+    expert: Act | None,
+    *,
+    episode_steps: int,
+    disturb: Disturb | None = None,
+    mesh: Mesh | None = None,
+) -> Trainer:
+    """Builds a trainer for one environment, one policy and one expert (None: its samples are recorded); arguments as of PPO."""
     imitation, axis = config.get_imitation(), off_policy.get_axis(mesh)
-    cloner, learner = bc.make_learner(policy, imitation, expert, axis), sac.make_learner(policy, config, axis)
+    cloner, learner = bc.make_learner(policy, imitation, expert, disturb, axis), sac.make_learner(policy, config, axis)
     reinforcing = off_policy.make_rounds("sac", env, learner, config, mesh)
     cloning = off_policy.make_rounds("bc", env, cloner, imitation, mesh, key="expert_buffer")
     starts = off_policy.count_starts(env, config, episode_steps=episode_steps)
     init = functools.partial(off_policy.init_train_state, [reinforcing, cloning], policy=policy, starts=starts)
     iterate = functools.partial(train_iteration, cloning, reinforcing, config.imitation_every, starts)
-    return trainer.compile_trainer(init, iterate, env, starts=starts, mesh=mesh)
+    recorded = cloning.name if expert is None else None
+    return trainer.compile_trainer(init, iterate, env, starts=starts, mesh=mesh, recorded=recorded)
 
 
 def make(config: Mapping[str, Any], env: Env, policy: Policy, *, mesh: Mesh | None = None) -> Trainer:
     """Builds the trainer of a config whose `learner` is BC-SAC."""
-    numbers, expert = off_policy.read_numbers(config, BCSACConfig), make_expert(config)
-    return make_trainer(env, policy, numbers, expert, episode_steps=environment.episode_steps(config["timing"]), mesh=mesh)
+    numbers, steps = off_policy.read_numbers(config, BCSACConfig), environment.episode_steps(config["timing"])
+    expert, disturb = make_expert(config), make_disturbance(numbers.expert_noise, config)
+    return make_trainer(env, policy, numbers, expert, episode_steps=steps, disturb=disturb, mesh=mesh)
