@@ -405,7 +405,7 @@ def test_names_of_a_study_fit_each_other(name):
     study_plan.check(hydra_config.load_config("study", f"study={name}"))
 
 
-@pytest.mark.parametrize("name", sorted(TIMED))
+@pytest.mark.parametrize("name", [pytest.param(n, marks=[pytest.mark.slow] if n == "curriculum" else []) for n in sorted(TIMED)])
 def test_every_row_of_a_study_of_equal_time_builds(name, tmp_path):
     """Every learner finds its keys and its network, all judge by the study's protocol, and each row has its time."""
     entry = hydra_config.load_config("study", f"study={name}", f"runs={tmp_path}", "train_scenes=train.bank", "test_scenes=test.bank")
