@@ -1,0 +1,227 @@
+"""Three dense layers with ReLU between them, of rows: plain JAX, and Triton kernels (Pallas) whose hidden values stay on the chip.
+
+Plain JAX writes the hidden values of every row to memory and reads them back, for the gradient too: 2 kB for a row of 40 bytes. Here one
+program computes a tile of rows from features to output. For the gradient a program loops over tiles of rows, computes their hidden values
+again for some channels of the second layer, and keeps the sums of the weights' gradients; sums of all programs are added up afterwards, in
+the same order every time.
+
+Arithmetic is that of plain JAX on the same GPU: products of float32 numbers in TF32, of bfloat16 numbers as they are. Sums and biases are
+float32.
+"""
+
+import functools
+
+import jax
+import jax.numpy as jnp
+from jax.experimental import pallas as pl
+from jax.experimental.pallas import triton as plgpu
+from jaxtyping import Array, Float
+
+from scenefactory_jax.core import pallas
+from scenefactory_jax.learning.networks.set_kernel import tiles
+
+Weights = list[tuple[Float[Array, "_ _"], Float[Array, " _"]]]
+
+ROWS = 128  # of a tile
+CHANNELS = 64  # of a tile of hidden values
+MAX_HIDDEN, MAX_OUTPUTS, MAX_FEATURES = 256, 128, 31  # more do not fit into the registers
+INPUTS = (16, 32)  # columns of a row on the chip: its features, a one for the bias, zeros
+MAX_SIZE = 2**31  # entries of an array, whose places are int32
+
+
+def fits(weights: Weights, x: Float[Array, "*batch F"]) -> bool:
+    """Whether the kernels can compute these layers: two of 64, 128, 192 or 256 channels and one of 32, 64 or 128, behind up to 31
+    features.
+    """
+    features, *widths = x.shape[-1], *(kernel.shape[1] for kernel, _ in weights)
+    rows = x.size // max(features, 1)
+    return (
+        len(widths) == 3
+        and all(width % CHANNELS == 0 and 0 < width <= MAX_HIDDEN for width in widths[:2])
+        and widths[2] in (32, 64, MAX_OUTPUTS)
+        and 0 < features <= MAX_FEATURES
+        and 0 < rows * max(features, widths[2]) < MAX_SIZE
+    )
+
+
+def embed(dtype: str, weights: Weights, x: Float[Array, "*batch F"]) -> Float[Array, "*batch D"]:
+    """Applies dense layers with ReLU between them; layers after the first multiply in `dtype`. Kernels on NVIDIA GPUs, if they fit."""
+    plain = functools.partial(embed_plain, dtype)
+    return pallas.on_gpu(functools.partial(embed_quick, dtype), plain, weights, x) if fits(weights, x) else plain(weights, x)
+
+
+def embed_plain(dtype: str, weights: Weights, x: Float[Array, "*batch F"]) -> Float[Array, "*batch D"]:
+    """`embed` in plain JAX."""
+    for index, (kernel, bias) in enumerate(weights):
+        kind = dtype if index else jnp.float32
+        x = jax.nn.relu(x.astype(dtype)) if index else x.astype(kind)
+        x = jnp.matmul(x, kernel.astype(kind)) + bias.astype(kind)
+    return x
+
+
+@functools.partial(jax.custom_vjp, nondiff_argnums=(0,))
+def embed_quick(dtype: str, weights: Weights, x: Float[Array, "*batch F"]) -> Float[Array, "*batch D"]:
+    """`embed` by the kernels. Forward-mode differentiation is not defined."""
+    return encode(dtype, weights, x)
+
+
+def _embed_forward(dtype: str, weights: Weights, x: Array) -> tuple[Array, tuple]:
+    return encode(dtype, weights, x), (weights, x)
+
+
+def _embed_backward(dtype: str, residuals: tuple, cotangent: Array) -> tuple[Weights, Array]:
+    weights, x = residuals
+    [of_rows] = jax.vjp(lambda x: embed_plain(dtype, weights, x), x)[1](cotangent)  # removed by the compiler where it is not used
+    return gradient(dtype, weights, x, cotangent), of_rows
+
+
+embed_quick.defvjp(_embed_forward, _embed_backward)
+
+
+def encode(
+    dtype: str, weights: Weights, x: Float[Array, "*batch F"], *, rows: int = ROWS, warps: int = 8, stages: int = 1, interpret: bool = False
+) -> Float[Array, "*batch D"]:
+    """Computes the embedding of each row.
+
+    Args:
+        rows: of a program.
+        warps, stages: of a program, see Triton.
+        interpret: run on any device, slowly.
+    """
+    (first, first_bias), (second, second_bias), (third, third_bias) = weights
+    *batch, features = x.shape
+    flat = x.reshape(-1, features).astype(jnp.float32)
+    operands = (flat, first, first_bias, second.astype(dtype), second_bias, third.astype(dtype), third_bias)
+    shape = jax.ShapeDtypeStruct((len(flat), third.shape[1]), dtype)
+    out = pl.pallas_call(
+        functools.partial(_encode, rows=rows),
+        grid=(pl.cdiv(len(flat), rows),),
+        in_specs=[*map(pallas.whole, operands)],
+        out_specs=pallas.whole(shape),
+        out_shape=shape,
+        compiler_params=plgpu.CompilerParams(num_warps=warps, num_stages=stages),
+        interpret=interpret,
+        name="embed_rows",
+    )(*operands)
+    return out.reshape(*batch, out.shape[-1])
+
+
+def _encode(x, first, first_bias, second, second_bias, third, third_bias, out, *, rows: int) -> None:
+    at = pl.program_id(0) * rows + jnp.arange(rows)
+    inner = _hidden(_load_rows(x, at), first, first_bias, second.dtype)
+    result = jnp.broadcast_to(third_bias[...][None, :], (rows, third.shape[1]))
+    for start, length in tiles(second.shape[1], CHANNELS):
+        hidden = _second(inner, second, second_bias, start, length)
+        result += _product(hidden, third[pl.ds(start, length), :])
+    columns = jnp.arange(third.shape[1])
+    plgpu.store(out.at[at[:, None], columns[None, :]], result.astype(out.dtype), mask=(at < len(x))[:, None])
+
+
+def gradient(
+    dtype: str,
+    weights: Weights,
+    x: Float[Array, "*batch F"],
+    cotangent: Float[Array, "*batch D"],
+    *,
+    rows: int = ROWS,
+    channels: int = CHANNELS,
+    programs: int = 132,
+    warps: int = 8,
+    stages: int = 1,
+    interpret: bool = False,
+) -> Weights:
+    """Computes the gradient of the weights.
+
+    Args:
+        rows, channels: of the second layer's values that a program holds at a time.
+        programs: about as many share the work; a GPU has 132 processors.
+    """
+    (first, first_bias), (second, second_bias), (third, _) = weights
+    features, hidden, middle, outputs = len(first), *second.shape, third.shape[1]
+    inputs, parts = _inputs(features), middle // channels
+    flat, pull = x.reshape(-1, features).astype(jnp.float32), cotangent.reshape(-1, outputs).astype(dtype)
+    programs = max(1, min(programs // parts, pl.cdiv(len(flat), rows)))
+    operands = (flat, pull, first, first_bias, second.astype(dtype), second_bias, third.astype(dtype))
+    sizes = {"first": (inputs, hidden), "second": (hidden, channels), "bias": (channels,), "third": (channels, outputs), "last": (outputs,)}
+    results = pl.pallas_call(
+        functools.partial(_gradient, rows=rows, channels=channels, programs=programs),
+        grid=(programs, parts),
+        in_specs=[*map(pallas.whole, operands)],
+        out_specs=[pl.BlockSpec((None, None, *size), lambda i, j, n=len(size): (i, j, *(0,) * n)) for size in sizes.values()],
+        out_shape=[jax.ShapeDtypeStruct((programs, parts, *size), jnp.float32) for size in sizes.values()],
+        compiler_params=plgpu.CompilerParams(num_warps=warps, num_stages=stages),
+        interpret=interpret,
+        name="embed_rows_gradient",
+    )(*operands)
+    of_first, of_second, bias, of_third, last = (jnp.sum(part, axis=0) for part in results)
+    of_first = jnp.sum(of_first, axis=0)
+    of_second = jnp.moveaxis(of_second, 0, 1).reshape(hidden, middle)
+    return [(of_first[:features], of_first[features]), (of_second, bias.reshape(-1)), (of_third.reshape(middle, outputs), last[0])]
+
+
+def _gradient(
+    x, pull, first, first_bias, second, second_bias, third, of_first, of_second, bias, of_third, last, *, rows, channels, programs
+) -> None:
+    program, start, dtype = pl.program_id(0), pl.program_id(1) * channels, second.dtype
+    parts, columns = tiles(first.shape[1], CHANNELS), jnp.arange(third.shape[1])
+
+    def add(index, sums):
+        sums_first, sums_second, sum_bias, sum_third, sum_last = sums
+        at = (program + index * programs) * rows + jnp.arange(rows)
+        table = _load_rows(x, at, one=True)
+        pulled = plgpu.load(pull.at[at[:, None], columns[None, :]], mask=(at < len(x))[:, None], other=0.0)
+        inner = _hidden(table, first, first_bias, dtype)
+        middle = _second(inner, second, second_bias, start, channels)
+        steep = jnp.where(middle > 0, _product(pulled, third[pl.ds(start, channels), :], (1, 1)), 0.0)
+        steep, sum_bias = steep.astype(dtype), sum_bias + jnp.sum(steep, axis=0)
+        sums_second = [total + _product(part, steep, (0, 0)) for total, part in zip(sums_second, inner, strict=True)]
+        results = []
+        for total, part, (k, width) in zip(sums_first, inner, parts, strict=True):
+            back = jnp.where(part > 0, _product(steep, second[pl.ds(k, width), pl.ds(start, channels)], (1, 1)), 0.0)
+            results.append(total + _product(table, back, (0, 0)))
+        sum_third += _product(middle, pulled, (0, 0))
+        return results, sums_second, sum_bias, sum_third, sum_last + jnp.sum(pulled.astype(jnp.float32), axis=0)
+
+    zeros = lambda *shape: jnp.zeros(shape, jnp.float32)  # noqa: E731
+    narrow, wide = [zeros(of_first.shape[0], width) for _, width in parts], [zeros(width, channels) for _, width in parts]
+    begin = narrow, wide, zeros(channels), zeros(*of_third.shape), zeros(*last.shape)
+    narrow, wide, bias[...], of_third[...], last[...] = jax.lax.fori_loop(0, pl.cdiv(pl.cdiv(len(x), rows) - program, programs), add, begin)
+    for (k, width), small, large in zip(parts, narrow, wide, strict=True):
+        of_first[:, pl.ds(k, width)] = small
+        of_second[pl.ds(k, width), :] = large
+
+
+def _inputs(features: int) -> int:
+    """Columns of a row on the chip."""
+    return next(count for count in INPUTS if features < count)
+
+
+def _load_rows(x, at: Array, *, one: bool = False) -> Array:
+    """Rows with zeros behind their features, and rows of zeros where there is none; with `one` the first column behind them is a one."""
+    count, features = x.shape
+    columns = jnp.arange(_inputs(features))
+    other = jnp.broadcast_to(jnp.where(columns == features, float(one), 0.0)[None, :], (len(at), len(columns)))
+    return plgpu.load(x.at[at[:, None], columns[None, :]], mask=(at < count)[:, None] & (columns < features)[None, :], other=other)
+
+
+def _hidden(table: Array, first, bias, dtype) -> list[Array]:
+    """Tiles of the first layer's values behind ReLU."""
+    rows, results = jnp.arange(table.shape[1]), []
+    for start, length in tiles(first.shape[1], CHANNELS):
+        columns = start + jnp.arange(length)
+        kernel = plgpu.load(first.at[rows[:, None], columns[None, :]], mask=(rows < len(first))[:, None], other=0.0)
+        values = _product(table, kernel) + bias[pl.ds(start, length)][None, :]
+        results.append(jnp.maximum(values, 0.0).astype(dtype))
+    return results
+
+
+def _second(inner: list[Array], second, bias, start, length: int) -> Array:
+    """The second layer's values behind ReLU, for some of its channels."""
+    parts = tiles(second.shape[0], CHANNELS)
+    values = [_product(part, second[pl.ds(k, width), pl.ds(start, length)]) for part, (k, width) in zip(inner, parts, strict=True)]
+    return jnp.maximum(functools.reduce(jnp.add, values) + bias[pl.ds(start, length)][None, :], 0.0).astype(second.dtype)
+
+
+def _product(a: Array, b: Array, along: tuple[int, int] = (1, 0)) -> Array:
+    """Multiplies matrices on the matrix units, over an axis of each; sums are float32."""
+    return jax.lax.dot_general(a, b, (((along[0],), (along[1],)), ((), ())), preferred_element_type=jnp.float32)
