@@ -123,72 +123,103 @@ def gradient(
     x: Float[Array, "*batch F"],
     cotangent: Float[Array, "*batch D"],
     *,
-    rows: int = ROWS,
-    channels: int = CHANNELS,
+    rows: int | None = None,
     programs: int = 132,
-    warps: int = 8,
-    stages: int = 1,
+    warps: tuple[int, int] = (8, 8),
+    stages: tuple[int, int] = (1, 1),
     interpret: bool = False,
 ) -> Weights:
-    """Computes the gradient of the weights.
+    """Computes the gradient of the weights: one kernel for the last two layers, and one for the first, behind the cotangent of the second.
 
     Args:
-        rows, channels: of the second layer's values that a program holds at a time.
+        rows: of a tile.
         programs: about as many share the work; a GPU has 132 processors.
+        warps, stages: of a program of each kernel.
     """
     (first, first_bias), (second, second_bias), (third, _) = weights
     features, hidden, middle, outputs = len(first), *second.shape, third.shape[1]
-    inputs, parts = _inputs(features), middle // channels
     flat, pull = x.reshape(-1, features).astype(jnp.float32), cotangent.reshape(-1, outputs).astype(dtype)
-    programs = max(1, min(programs // parts, pl.cdiv(len(flat), rows)))
-    operands = (flat, pull, first, first_bias, second.astype(dtype), second_bias, third.astype(dtype))
-    sizes = {"first": (inputs, hidden), "second": (hidden, channels), "bias": (channels,), "third": (channels, outputs), "last": (outputs,)}
-    results = pl.pallas_call(
-        functools.partial(_gradient, rows=rows, channels=channels, programs=programs),
-        grid=(programs, parts),
-        in_specs=[*map(pallas.whole, operands)],
-        out_specs=[pl.BlockSpec((None, None, *size), lambda i, j, n=len(size): (i, j, *(0,) * n)) for size in sizes.values()],
-        out_shape=[jax.ShapeDtypeStruct((programs, parts, *size), jnp.float32) for size in sizes.values()],
-        compiler_params=plgpu.CompilerParams(num_warps=warps, num_stages=stages),
-        interpret=interpret,
-        name="embed_rows_gradient",
-    )(*operands)
-    of_first, of_second, bias, of_third, last = (jnp.sum(part, axis=0) for part in results)
-    of_first = jnp.sum(of_first, axis=0)
-    of_second = jnp.moveaxis(of_second, 0, 1).reshape(hidden, middle)
-    return [(of_first[:features], of_first[features]), (of_second, bias.reshape(-1)), (of_third.reshape(middle, outputs), last[0])]
+    rows = rows or (ROWS if dtype == "bfloat16" else ROWS // 2)
+
+    def call(kernel, index: int, name: str, width: int, arrays: list[jax.ShapeDtypeStruct], sums: list[tuple[int, ...]], *operands: Array):
+        parts = width // CHANNELS
+        share = max(1, min(programs // parts, pl.cdiv(len(flat), rows)))
+        each = [pl.BlockSpec((None, None, *size), lambda i, j, n=len(size): (i, j, *(0,) * n)) for size in sums]
+        results = pl.pallas_call(
+            functools.partial(kernel, rows=rows, programs=share),
+            grid=(share, parts),
+            in_specs=[*map(pallas.whole, operands)],
+            out_specs=[*map(pallas.whole, arrays), *each],
+            out_shape=[*arrays, *(jax.ShapeDtypeStruct((share, parts, *size), jnp.float32) for size in sums)],
+            compiler_params=plgpu.CompilerParams(num_warps=warps[index], num_stages=stages[index]),
+            interpret=interpret,
+            name=name,
+        )(*operands)
+        return *results[: len(arrays)], *(jnp.sum(part, axis=0) for part in results[len(arrays) :])
+
+    second = second.astype(dtype)
+    steep, of_second, of_bias, of_third = call(
+        _gradient_of_last, 0, "embed_rows_gradient", middle,
+        [jax.ShapeDtypeStruct((len(flat), middle), dtype)], [(CHANNELS, hidden), (CHANNELS,), (CHANNELS, outputs)],
+        flat, pull, first, first_bias, second, second_bias, third.astype(dtype),
+    )  # fmt: skip
+    [of_first] = call(
+        _gradient_of_first, 1, "embed_rows_gradient_of_first", hidden, [], [(_inputs(features), CHANNELS)],
+        flat, steep, first, first_bias, second,
+    )  # fmt: skip
+    of_first = jnp.moveaxis(of_first, 0, 1).reshape(-1, hidden)
+    return [
+        (of_first[:features], of_first[features]),
+        (of_second.reshape(middle, hidden).T, of_bias.reshape(-1)),
+        (of_third.reshape(middle, outputs), jnp.sum(pull, axis=0, dtype=jnp.float32)),
+    ]
 
 
-def _gradient(
-    x, pull, first, first_bias, second, second_bias, third, of_first, of_second, bias, of_third, last, *, rows, channels, programs
+def _gradient_of_last(
+    x, pull, first, first_bias, second, second_bias, third, steep, of_second, of_bias, of_third, *, rows: int, programs: int
 ) -> None:
-    program, start, dtype = pl.program_id(0), pl.program_id(1) * channels, second.dtype
-    parts, columns = tiles(first.shape[1], CHANNELS), jnp.arange(third.shape[1])
+    """For some channels of the second layer: the cotangent in front of its ReLU, and gradients of its weights, transposed, and behind it."""
+    program, start = pl.program_id(0), pl.program_id(1) * CHANNELS
+    parts, columns, mine = tiles(first.shape[1], CHANNELS), jnp.arange(third.shape[1]), start + jnp.arange(CHANNELS)
 
     def add(index, sums):
-        sums_first, sums_second, sum_bias, sum_third, sum_last = sums
+        wide, bias, last = sums
         at = (program + index * programs) * rows + jnp.arange(rows)
-        table = _load_rows(x, at, one=True)
-        pulled = plgpu.load(pull.at[at[:, None], columns[None, :]], mask=(at < len(x))[:, None], other=0.0)
-        inner = _hidden(table, first, first_bias, dtype)
-        middle = _second(inner, second, second_bias, start, channels)
-        steep = jnp.where(middle > 0, _product(pulled, third[pl.ds(start, channels), :], (1, 1)), 0.0)
-        steep, sum_bias = steep.astype(dtype), sum_bias + jnp.sum(steep, axis=0)
-        sums_second = [total + _product(part, steep, (0, 0)) for total, part in zip(sums_second, inner, strict=True)]
-        results = []
-        for total, part, (k, width) in zip(sums_first, inner, parts, strict=True):
-            back = jnp.where(part > 0, _product(steep, second[pl.ds(k, width), pl.ds(start, channels)], (1, 1)), 0.0)
-            results.append(total + _product(table, back, (0, 0)))
-        sum_third += _product(middle, pulled, (0, 0))
-        return results, sums_second, sum_bias, sum_third, sum_last + jnp.sum(pulled.astype(jnp.float32), axis=0)
+        exists = (at < len(x))[:, None]
+        inner = _hidden(_load_rows(x, at), first, first_bias, second.dtype)
+        middle = _second(inner, second, second_bias, start, CHANNELS)
+        pulled = plgpu.load(pull.at[at[:, None], columns[None, :]], mask=exists, other=0.0)
+        change = jnp.where(middle > 0, _product(pulled, third[pl.ds(start, CHANNELS), :], (1, 1)), 0.0)
+        bias += jnp.sum(change, axis=0)
+        change = change.astype(second.dtype)
+        plgpu.store(steep.at[at[:, None], mine[None, :]], change, mask=exists)
+        return [total + _product(change, part, (0, 0)) for total, part in zip(wide, inner, strict=True)], bias, last + _product(middle, pulled, (0, 0))
 
     zeros = lambda *shape: jnp.zeros(shape, jnp.float32)  # noqa: E731
-    narrow, wide = [zeros(of_first.shape[0], width) for _, width in parts], [zeros(width, channels) for _, width in parts]
-    begin = narrow, wide, zeros(channels), zeros(*of_third.shape), zeros(*last.shape)
-    narrow, wide, bias[...], of_third[...], last[...] = jax.lax.fori_loop(0, pl.cdiv(pl.cdiv(len(x), rows) - program, programs), add, begin)
-    for (k, width), small, large in zip(parts, narrow, wide, strict=True):
-        of_first[:, pl.ds(k, width)] = small
-        of_second[pl.ds(k, width), :] = large
+    begin = [zeros(CHANNELS, width) for _, width in parts], zeros(CHANNELS), zeros(*of_third.shape)
+    wide, of_bias[...], of_third[...] = jax.lax.fori_loop(0, pl.cdiv(pl.cdiv(len(x), rows) - program, programs), add, begin)
+    for (k, width), total in zip(parts, wide, strict=True):
+        of_second[:, pl.ds(k, width)] = total
+
+
+def _gradient_of_first(x, steep, first, first_bias, second, of_first, *, rows: int, programs: int) -> None:
+    """For some channels of the first layer: the gradient of its weights."""
+    program, start = pl.program_id(0), pl.program_id(1) * CHANNELS
+    parts = tiles(second.shape[1], CHANNELS)
+
+    def add(index, total):
+        at = (program + index * programs) * rows + jnp.arange(rows)
+        table = _load_rows(x, at, one=True)
+        [inner] = _hidden(table, first, first_bias, second.dtype, [(start, CHANNELS)])
+        back = []
+        for k, width in parts:
+            columns = k + jnp.arange(width)
+            change = plgpu.load(steep.at[at[:, None], columns[None, :]], mask=(at < len(x))[:, None], other=0.0)
+            back.append(_product(change, second[pl.ds(start, CHANNELS), pl.ds(k, width)], (1, 1)))
+        return total + _product(table, jnp.where(inner > 0, functools.reduce(jnp.add, back), 0.0), (0, 0))
+
+    begin = jnp.zeros(of_first.shape, jnp.float32)
+    of_first[...] = jax.lax.fori_loop(0, pl.cdiv(pl.cdiv(len(x), rows) - program, programs), add, begin)
 
 
 def _inputs(features: int) -> int:
@@ -204,10 +235,10 @@ def _load_rows(x, at: Array, *, one: bool = False) -> Array:
     return plgpu.load(x.at[at[:, None], columns[None, :]], mask=(at < count)[:, None] & (columns < features)[None, :], other=other)
 
 
-def _hidden(table: Array, first, bias, dtype) -> list[Array]:
-    """Tiles of the first layer's values behind ReLU."""
+def _hidden(table: Array, first, bias, dtype, parts: list | None = None) -> list[Array]:
+    """Tiles of the first layer's values behind ReLU; all of them, or some parts."""
     rows, results = jnp.arange(table.shape[1]), []
-    for start, length in tiles(first.shape[1], CHANNELS):
+    for start, length in parts or tiles(first.shape[1], CHANNELS):
         columns = start + jnp.arange(length)
         kernel = plgpu.load(first.at[rows[:, None], columns[None, :]], mask=(rows < len(first))[:, None], other=0.0)
         values = _product(table, kernel) + bias[pl.ds(start, length)][None, :]
