@@ -10,6 +10,7 @@ float32.
 """
 
 import functools
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -144,7 +145,7 @@ def gradient(
     def call(kernel, index: int, name: str, width: int, arrays: list[jax.ShapeDtypeStruct], sums: list[tuple[int, ...]], *operands: Array):
         parts = width // CHANNELS
         share = max(1, min(programs // parts, pl.cdiv(len(flat), rows)))
-        each = [pl.BlockSpec((None, None, *size), lambda i, j, n=len(size): (i, j, *(0,) * n)) for size in sums]
+        each = [pl.BlockSpec((None, None, *size), functools.partial(_place, len(size))) for size in sums]
         results = pl.pallas_call(
             functools.partial(kernel, rows=rows, programs=share),
             grid=(share, parts),
@@ -178,7 +179,7 @@ def gradient(
 def _gradient_of_last(
     x, pull, first, first_bias, second, second_bias, third, steep, of_second, of_bias, of_third, *, rows: int, programs: int
 ) -> None:
-    """For some channels of the second layer: the cotangent in front of its ReLU, and gradients of its weights, transposed, and behind it."""
+    """For some channels of the second layer: the cotangent before ReLU, and the gradients of its weights (transposed) and the third's."""
     program, start = pl.program_id(0), pl.program_id(1) * CHANNELS
     parts, columns, mine = tiles(first.shape[1], CHANNELS), jnp.arange(third.shape[1]), start + jnp.arange(CHANNELS)
 
@@ -193,7 +194,8 @@ def _gradient_of_last(
         bias += jnp.sum(change, axis=0)
         change = change.astype(second.dtype)
         plgpu.store(steep.at[at[:, None], mine[None, :]], change, mask=exists)
-        return [total + _product(change, part, (0, 0)) for total, part in zip(wide, inner, strict=True)], bias, last + _product(middle, pulled, (0, 0))
+        wide = [total + _product(change, part, (0, 0)) for total, part in zip(wide, inner, strict=True)]
+        return wide, bias, last + _product(middle, pulled, (0, 0))
 
     zeros = lambda *shape: jnp.zeros(shape, jnp.float32)  # noqa: E731
     begin = [zeros(CHANNELS, width) for _, width in parts], zeros(CHANNELS), zeros(*of_third.shape)
@@ -220,6 +222,11 @@ def _gradient_of_first(x, steep, first, first_bias, second, of_first, *, rows: i
 
     begin = jnp.zeros(of_first.shape, jnp.float32)
     of_first[...] = jax.lax.fori_loop(0, pl.cdiv(pl.cdiv(len(x), rows) - program, programs), add, begin)
+
+
+def _place(axes: int, program: Any, part: Any) -> tuple:
+    """Where in an array of all programs' sums those of one program and part are."""
+    return (program, part, *(0,) * axes)
 
 
 def _inputs(features: int) -> int:
