@@ -51,32 +51,33 @@ def test_half_precision_rounds_what_plain_jax_rounds():
 
 
 @pytest.mark.parametrize(
-    ("sizes", "rows", "made"),
+    ("sizes", "rows", "half"),
     [
         ((13, 256, 256, 64), (3, 5), True), ((31, 64, 192, 32), (1,), True), ((32, 64, 64, 32), (1,), False), ((5, 256, 64), (1,), False),
         ((5, 64, 64, 48), (1,), False), ((5, 96, 64, 32), (1,), False), ((5, 320, 64, 32), (1,), False), ((5, 64, 64, 32), (0,), False),
         ((5, 64, 64, 64), (2**25,), False),
     ],
 )  # fmt: skip
-def test_supported_layers(sizes, rows, made):
+def test_supported_layers(sizes, rows, half):
     shape = lambda *sizes: jax.ShapeDtypeStruct(sizes, jnp.float32)  # noqa: E731
     found = []
     weights = [(shape(i, o), shape(o)) for i, o in itertools.pairwise(sizes)]
-    jax.eval_shape(lambda weights, x: found.append(kernel.fits(weights, x)), weights, shape(*rows, sizes[0]))
-    assert found == [made]
+    fit = lambda weights, x: found.extend(kernel.fits(dtype, weights, x) for dtype in ("bfloat16", "float32"))  # noqa: E731
+    jax.eval_shape(fit, weights, shape(*rows, sizes[0]))
+    assert found == [half, False]
 
 
-@pytest.mark.parametrize("dtype", ["float32", "bfloat16"])
-def test_a_gpu_gets_kernels_and_other_devices_plain_jax(dtype):
+def test_a_gpu_gets_kernels_in_half_precision_and_other_devices_plain_jax():
     weights, x = layers(0, 5, 64, 64, 32), draw(1, 40, 5)
 
-    def text(platform):
+    def text(dtype, platform):
         loss = jax.jit(jax.grad(lambda weights: kernel.embed(dtype, weights, x).sum()))
         with abstract_gpu():
             return loss.trace(weights).lower(lowering_platforms=(platform,)).as_text()
 
-    assert "embed_rows_gradient" in text("cuda") and "embed_rows_gradient_of_first" in text("cuda")
-    assert "triton" not in text("cpu")
+    quick = text("bfloat16", "cuda")
+    assert "embed_rows_gradient" in quick and "embed_rows_gradient_of_first" in quick
+    assert "triton" not in text("bfloat16", "cpu") and "triton" not in text("float32", "cuda")
 
 
 def test_the_gradient_of_rows_is_that_of_plain_jax(monkeypatch):

@@ -30,14 +30,15 @@ INPUTS = (16, 32)  # columns of a row on the chip: its features, a one for the b
 MAX_SIZE = 2**31  # entries of an array, whose places are int32
 
 
-def fits(weights: Weights, x: Float[Array, "*batch F"]) -> bool:
-    """Whether the kernels can compute these layers: two of 64, 128, 192 or 256 channels and one of 32, 64 or 128, behind up to 31
-    features.
+def fits(dtype: str, weights: Weights, x: Float[Array, "*batch F"]) -> bool:
+    """Whether the kernels compute these layers: in bfloat16, two of 64, 128, 192 or 256 channels and one of 32, 64 or 128, behind up to
+    31 features. In float32 plain JAX is faster.
     """
     features, *widths = x.shape[-1], *(kernel.shape[1] for kernel, _ in weights)
     rows = x.size // max(features, 1)
     return (
-        len(widths) == 3
+        dtype == "bfloat16"
+        and len(widths) == 3
         and all(width % CHANNELS == 0 and 0 < width <= MAX_HIDDEN for width in widths[:2])
         and widths[2] in (32, 64, MAX_OUTPUTS)
         and 0 < features <= MAX_FEATURES
@@ -48,7 +49,7 @@ def fits(weights: Weights, x: Float[Array, "*batch F"]) -> bool:
 def embed(dtype: str, weights: Weights, x: Float[Array, "*batch F"]) -> Float[Array, "*batch D"]:
     """Applies dense layers with ReLU between them; layers after the first multiply in `dtype`. Kernels on NVIDIA GPUs, if they fit."""
     plain = functools.partial(embed_plain, dtype)
-    return pallas.on_gpu(functools.partial(embed_quick, dtype), plain, weights, x) if fits(weights, x) else plain(weights, x)
+    return pallas.on_gpu(functools.partial(embed_quick, dtype), plain, weights, x) if fits(dtype, weights, x) else plain(weights, x)
 
 
 def embed_plain(dtype: str, weights: Weights, x: Float[Array, "*batch F"]) -> Float[Array, "*batch D"]:
@@ -124,8 +125,9 @@ def gradient(
     x: Float[Array, "*batch F"],
     cotangent: Float[Array, "*batch D"],
     *,
-    rows: int | None = None,
+    rows: int = ROWS,
     programs: int = 132,
+    channels: int = 2 * CHANNELS,
     warps: tuple[int, int] = (8, 8),
     stages: tuple[int, int] = (1, 1),
     interpret: bool = False,
@@ -140,10 +142,9 @@ def gradient(
     (first, first_bias), (second, second_bias), (third, _) = weights
     features, hidden, middle, outputs = len(first), *second.shape, third.shape[1]
     flat, pull = x.reshape(-1, features).astype(jnp.float32), cotangent.reshape(-1, outputs).astype(dtype)
-    rows = rows or (ROWS if dtype == "bfloat16" else ROWS // 2)
+    channels = channels if hidden % channels == 0 else CHANNELS
 
-    def call(kernel, index: int, name: str, width: int, arrays: list[jax.ShapeDtypeStruct], sums: list[tuple[int, ...]], *operands: Array):
-        parts = width // CHANNELS
+    def call(kernel, index: int, name: str, parts: int, arrays: list[jax.ShapeDtypeStruct], sums: list[tuple[int, ...]], *operands: Array):
         share = max(1, min(programs // parts, pl.cdiv(len(flat), rows)))
         each = [pl.BlockSpec((None, None, *size), functools.partial(_place, len(size))) for size in sums]
         results = pl.pallas_call(
@@ -160,12 +161,12 @@ def gradient(
 
     second = second.astype(dtype)
     steep, of_second, of_bias, of_third = call(
-        _gradient_of_last, 0, "embed_rows_gradient", middle,
+        _gradient_of_last, 0, "embed_rows_gradient", middle // CHANNELS,
         [jax.ShapeDtypeStruct((len(flat), middle), dtype)], [(CHANNELS, hidden), (CHANNELS,), (CHANNELS, outputs)],
         flat, pull, first, first_bias, second, second_bias, third.astype(dtype),
     )  # fmt: skip
     [of_first] = call(
-        _gradient_of_first, 1, "embed_rows_gradient_of_first", hidden, [], [(_inputs(features), CHANNELS)],
+        _gradient_of_first, 1, "embed_rows_gradient_of_first", hidden // channels, [], [(_inputs(features), channels)],
         flat, steep, first, first_bias, second,
     )  # fmt: skip
     of_first = jnp.moveaxis(of_first, 0, 1).reshape(-1, hidden)
@@ -206,18 +207,19 @@ def _gradient_of_last(
 
 def _gradient_of_first(x, steep, first, first_bias, second, of_first, *, rows: int, programs: int) -> None:
     """For some channels of the first layer: the gradient of its weights."""
-    program, start = pl.program_id(0), pl.program_id(1) * CHANNELS
+    channels = of_first.shape[1]
+    program, start = pl.program_id(0), pl.program_id(1) * channels
     parts = tiles(second.shape[1], CHANNELS)
 
     def add(index, total):
         at = (program + index * programs) * rows + jnp.arange(rows)
         table = _load_rows(x, at, one=True)
-        [inner] = _hidden(table, first, first_bias, second.dtype, [(start, CHANNELS)])
+        [inner] = _hidden(table, first, first_bias, second.dtype, [(start, channels)])
         back = []
         for k, width in parts:
             columns = k + jnp.arange(width)
             change = plgpu.load(steep.at[at[:, None], columns[None, :]], mask=(at < len(x))[:, None], other=0.0)
-            back.append(_product(change, second[pl.ds(start, CHANNELS), pl.ds(k, width)], (1, 1)))
+            back.append(_product(change, second[pl.ds(start, channels), pl.ds(k, width)], (1, 1)))
         return total + _product(table, jnp.where(inner > 0, functools.reduce(jnp.add, back), 0.0), (0, 0))
 
     begin = jnp.zeros(of_first.shape, jnp.float32)
