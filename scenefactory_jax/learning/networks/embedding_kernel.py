@@ -25,31 +25,34 @@ Weights = list[tuple[Float[Array, "_ _"], Float[Array, " _"]]]
 
 ROWS = 128  # of a tile
 CHANNELS = 64  # of a tile of hidden values
-MAX_HIDDEN, MAX_OUTPUTS, MAX_FEATURES = 256, 128, 31  # more do not fit into the registers
-INPUTS = (16, 32)  # columns of a row on the chip: its features, a one for the bias, zeros
+INPUTS = 16  # columns of a row on the chip: its features, a one for the bias, zeros
+HIDDEN, OUTPUTS = (64, 128, 192, 256), (32, 64)  # widths; more do not fit into registers and shared memory
+CAPABILITY = "9.0"  # of GPUs that the kernels were measured on (H100, H200); others have less shared memory
 MAX_SIZE = 2**31  # entries of an array, whose places are int32
 
 
 def fits(dtype: str, weights: Weights, x: Float[Array, "*batch F"]) -> bool:
-    """Whether the kernels compute these layers: in bfloat16, two of 64, 128, 192 or 256 channels and one of 32, 64 or 128, behind up to
-    31 features. In float32 plain JAX is faster.
+    """Whether the kernels compute these layers: in bfloat16, two of 64, 128, 192 or 256 channels and one of 32 or 64, behind fewer than 16
+    features. In float32 plain JAX is faster.
     """
-    features, *widths = x.shape[-1], *(kernel.shape[1] for kernel, _ in weights)
-    rows = x.size // max(features, 1)
-    return (
-        dtype == "bfloat16"
-        and len(widths) == 3
-        and all(width % CHANNELS == 0 and 0 < width <= MAX_HIDDEN for width in widths[:2])
-        and widths[2] in (32, 64, MAX_OUTPUTS)
-        and 0 < features <= MAX_FEATURES
-        and 0 < rows * max(features, widths[2]) < MAX_SIZE
-    )
+    features, widths = x.shape[-1], [kernel.shape[1] for kernel, _ in weights]
+    if dtype != "bfloat16" or len(widths) != 3 or not 0 < features < INPUTS:
+        return False
+    return {*widths[:2]} <= {*HIDDEN} and widths[2] in OUTPUTS and 0 < x.size // features * max(features, *widths) < MAX_SIZE
+
+
+def _known_gpu() -> bool:
+    """Whether GPUs, if there are any, are those that the kernels are for."""
+    try:
+        return all(device.compute_capability == CAPABILITY for device in jax.local_devices(backend="cuda"))
+    except RuntimeError:  # no GPU: a program that is only lowered
+        return True
 
 
 def embed(dtype: str, weights: Weights, x: Float[Array, "*batch F"]) -> Float[Array, "*batch D"]:
-    """Applies dense layers with ReLU between them; layers after the first multiply in `dtype`. Kernels on NVIDIA GPUs, if they fit."""
-    plain = functools.partial(embed_plain, dtype)
-    return pallas.on_gpu(functools.partial(embed_quick, dtype), plain, weights, x) if fits(dtype, weights, x) else plain(weights, x)
+    """Applies dense layers with ReLU between them; layers after the first multiply in `dtype`. Kernels on an H100, if they fit."""
+    quick, plain = functools.partial(embed_quick, dtype), functools.partial(embed_plain, dtype)
+    return pallas.on_gpu(quick, plain, weights, x) if fits(dtype, weights, x) and _known_gpu() else plain(weights, x)
 
 
 def embed_plain(dtype: str, weights: Weights, x: Float[Array, "*batch F"]) -> Float[Array, "*batch D"]:
@@ -125,11 +128,11 @@ def gradient(
     x: Float[Array, "*batch F"],
     cotangent: Float[Array, "*batch D"],
     *,
-    rows: int = ROWS,
+    rows: int = ROWS // 2,
     programs: int = 132,
     channels: int = 2 * CHANNELS,
-    warps: tuple[int, int] = (8, 8),
-    stages: tuple[int, int] = (1, 1),
+    warps: int = 8,
+    stages: tuple[int, int] = (1, 3),
     interpret: bool = False,
 ) -> Weights:
     """Computes the gradient of the weights: one kernel for the last two layers, and one for the first, behind the cotangent of the second.
@@ -137,12 +140,15 @@ def gradient(
     Args:
         rows: of a tile.
         programs: about as many share the work; a GPU has 132 processors.
-        warps, stages: of a program of each kernel.
+        channels: that a program holds, half as many in layers that these do not divide.
+        warps: of a program.
+        stages: of a program of each kernel.
     """
     (first, first_bias), (second, second_bias), (third, _) = weights
     features, hidden, middle, outputs = len(first), *second.shape, third.shape[1]
     flat, pull = x.reshape(-1, features).astype(jnp.float32), cotangent.reshape(-1, outputs).astype(dtype)
-    channels = channels if hidden % channels == 0 else CHANNELS
+
+    some, others = (channels if width % channels == 0 else CHANNELS for width in (middle, hidden))
 
     def call(kernel, index: int, name: str, parts: int, arrays: list[jax.ShapeDtypeStruct], sums: list[tuple[int, ...]], *operands: Array):
         share = max(1, min(programs // parts, pl.cdiv(len(flat), rows)))
@@ -153,7 +159,7 @@ def gradient(
             in_specs=[*map(pallas.whole, operands)],
             out_specs=[*map(pallas.whole, arrays), *each],
             out_shape=[*arrays, *(jax.ShapeDtypeStruct((share, parts, *size), jnp.float32) for size in sums)],
-            compiler_params=plgpu.CompilerParams(num_warps=warps[index], num_stages=stages[index]),
+            compiler_params=plgpu.CompilerParams(num_warps=warps, num_stages=stages[index]),
             interpret=interpret,
             name=name,
         )(*operands)
@@ -161,15 +167,15 @@ def gradient(
 
     second = second.astype(dtype)
     steep, of_second, of_bias, of_third = call(
-        _gradient_of_last, 0, "embed_rows_gradient", middle // CHANNELS,
-        [jax.ShapeDtypeStruct((len(flat), middle), dtype)], [(CHANNELS, hidden), (CHANNELS,), (CHANNELS, outputs)],
+        _gradient_of_last, 0, "embed_rows_gradient", middle // some,
+        [jax.ShapeDtypeStruct((middle, len(flat)), dtype)], [(some, hidden), (some,), (some, outputs)],
         flat, pull, first, first_bias, second, second_bias, third.astype(dtype),
     )  # fmt: skip
     [of_first] = call(
-        _gradient_of_first, 1, "embed_rows_gradient_of_first", hidden // channels, [], [(_inputs(features), channels)],
+        _gradient_of_first, 1, "embed_rows_gradient_of_first", hidden // others, [], [(others, INPUTS)],
         flat, steep, first, first_bias, second,
     )  # fmt: skip
-    of_first = jnp.moveaxis(of_first, 0, 1).reshape(-1, hidden)
+    of_first = of_first.reshape(hidden, -1).T
     return [
         (of_first[:features], of_first[features]),
         (of_second.reshape(middle, hidden).T, of_bias.reshape(-1)),
@@ -181,46 +187,48 @@ def _gradient_of_last(
     x, pull, first, first_bias, second, second_bias, third, steep, of_second, of_bias, of_third, *, rows: int, programs: int
 ) -> None:
     """For some channels of the second layer: the cotangent before ReLU, and the gradients of its weights (transposed) and the third's."""
-    program, start = pl.program_id(0), pl.program_id(1) * CHANNELS
-    parts, columns, mine = tiles(first.shape[1], CHANNELS), jnp.arange(third.shape[1]), start + jnp.arange(CHANNELS)
+    channels, outputs = of_third.shape
+    program, start = pl.program_id(0), pl.program_id(1) * channels
+    mine, columns, parts = start + jnp.arange(channels), jnp.arange(outputs), tiles(len(second), channels)
 
     def add(index, sums):
         wide, bias, last = sums
         at = (program + index * programs) * rows + jnp.arange(rows)
-        exists = (at < len(x))[:, None]
-        inner = _hidden(_load_rows(x, at), first, first_bias, second.dtype)
-        middle = _second(inner, second, second_bias, start, CHANNELS)
-        pulled = plgpu.load(pull.at[at[:, None], columns[None, :]], mask=exists, other=0.0)
-        change = jnp.where(middle > 0, _product(pulled, third[pl.ds(start, CHANNELS), :], (1, 1)), 0.0)
-        bias += jnp.sum(change, axis=0)
+        table = _load_rows(x, at)
+        pulled = plgpu.load(pull.at[at[:, None], columns[None, :]], mask=(at < len(x))[:, None], other=0.0)
+        inner = [_turned_hidden(table, first, first_bias, second.dtype, k, width) for k, width in parts]
+        kernels = [second[pl.ds(k, width), pl.ds(start, channels)] for k, width in parts]
+        middle = functools.reduce(jnp.add, [_product(turned, part, (0, 0)) for turned, part in zip(kernels, inner, strict=True)])
+        middle = jnp.maximum(middle + second_bias[pl.ds(start, channels)][:, None], 0.0).astype(second.dtype)
+        change = jnp.where(middle > 0, _product(third[pl.ds(start, channels), :], pulled, (1, 1)), 0.0)
+        bias += jnp.sum(change, axis=1)
         change = change.astype(second.dtype)
-        plgpu.store(steep.at[at[:, None], mine[None, :]], change, mask=exists)
-        wide = [total + _product(change, part, (0, 0)) for total, part in zip(wide, inner, strict=True)]
-        return wide, bias, last + _product(middle, pulled, (0, 0))
+        plgpu.store(steep.at[mine[:, None], at[None, :]], change, mask=(at < len(x))[None, :])
+        wide = [total + _product(change, part, (1, 1)) for total, part in zip(wide, inner, strict=True)]
+        return wide, bias, last + _product(middle, pulled)
 
     zeros = lambda *shape: jnp.zeros(shape, jnp.float32)  # noqa: E731
-    begin = [zeros(CHANNELS, width) for _, width in parts], zeros(CHANNELS), zeros(*of_third.shape)
+    begin = [zeros(channels, width) for _, width in parts], zeros(channels), zeros(channels, outputs)
     wide, of_bias[...], of_third[...] = jax.lax.fori_loop(0, pl.cdiv(pl.cdiv(len(x), rows) - program, programs), add, begin)
     for (k, width), total in zip(parts, wide, strict=True):
         of_second[:, pl.ds(k, width)] = total
 
 
 def _gradient_of_first(x, steep, first, first_bias, second, of_first, *, rows: int, programs: int) -> None:
-    """For some channels of the first layer: the gradient of its weights."""
-    channels = of_first.shape[1]
+    """For some channels of the first layer: the gradient of its weights, transposed."""
+    channels = len(of_first)
     program, start = pl.program_id(0), pl.program_id(1) * channels
     parts = tiles(second.shape[1], CHANNELS)
 
     def add(index, total):
         at = (program + index * programs) * rows + jnp.arange(rows)
-        table = _load_rows(x, at, one=True)
-        [inner] = _hidden(table, first, first_bias, second.dtype, [(start, channels)])
-        back = []
+        table, back = _load_rows(x, at, one=True), []
         for k, width in parts:
             columns = k + jnp.arange(width)
-            change = plgpu.load(steep.at[at[:, None], columns[None, :]], mask=(at < len(x))[:, None], other=0.0)
-            back.append(_product(change, second[pl.ds(start, channels), pl.ds(k, width)], (1, 1)))
-        return total + _product(table, jnp.where(inner > 0, functools.reduce(jnp.add, back), 0.0), (0, 0))
+            change = plgpu.load(steep.at[columns[:, None], at[None, :]], mask=(at < len(x))[None, :], other=0.0)
+            back.append(_product(second[pl.ds(start, channels), pl.ds(k, width)], change))
+        inner = _turned_hidden(table, first, first_bias, second.dtype, start, channels)
+        return total + _product(jnp.where(inner > 0, functools.reduce(jnp.add, back), 0.0), table)
 
     begin = jnp.zeros(of_first.shape, jnp.float32)
     of_first[...] = jax.lax.fori_loop(0, pl.cdiv(pl.cdiv(len(x), rows) - program, programs), add, begin)
@@ -231,28 +239,33 @@ def _place(axes: int, program: Any, part: Any) -> tuple:
     return (program, part, *(0,) * axes)
 
 
-def _inputs(features: int) -> int:
-    """Columns of a row on the chip."""
-    return next(count for count in INPUTS if features < count)
-
-
 def _load_rows(x, at: Array, *, one: bool = False) -> Array:
     """Rows with zeros behind their features, and rows of zeros where there is none; with `one` the first column behind them is a one."""
     count, features = x.shape
-    columns = jnp.arange(_inputs(features))
+    columns = jnp.arange(INPUTS)
     other = jnp.broadcast_to(jnp.where(columns == features, float(one), 0.0)[None, :], (len(at), len(columns)))
     return plgpu.load(x.at[at[:, None], columns[None, :]], mask=(at < count)[:, None] & (columns < features)[None, :], other=other)
 
 
-def _hidden(table: Array, first, bias, dtype, parts: list | None = None) -> list[Array]:
-    """Tiles of the first layer's values behind ReLU; all of them, or some parts."""
-    rows, results = jnp.arange(table.shape[1]), []
-    for start, length in parts or tiles(first.shape[1], CHANNELS):
-        columns = start + jnp.arange(length)
-        kernel = plgpu.load(first.at[rows[:, None], columns[None, :]], mask=(rows < len(first))[:, None], other=0.0)
-        values = _product(table, kernel) + bias[pl.ds(start, length)][None, :]
-        results.append(jnp.maximum(values, 0.0).astype(dtype))
-    return results
+def _hidden(table: Array, first, bias, dtype) -> list[Array]:
+    """Tiles of the first layer's values behind ReLU."""
+    values = [
+        _product(table, _load_first(first, start, length)) + bias[pl.ds(start, length)][None, :]
+        for start, length in tiles(first.shape[1], CHANNELS)
+    ]
+    return [jnp.maximum(part, 0.0).astype(dtype) for part in values]
+
+
+def _turned_hidden(table: Array, first, bias, dtype, start, length: int) -> Array:
+    """The first layer's values behind ReLU, channels by rows, for some of its channels."""
+    values = _product(_load_first(first, start, length), table, (0, 1)) + bias[pl.ds(start, length)][:, None]
+    return jnp.maximum(values, 0.0).astype(dtype)
+
+
+def _load_first(first, start, length: int) -> Array:
+    """Some columns of the first layer's kernel, with zeros behind its features."""
+    rows, columns = jnp.arange(INPUTS), start + jnp.arange(length)
+    return plgpu.load(first.at[rows[:, None], columns[None, :]], mask=(rows < len(first))[:, None], other=0.0)
 
 
 def _second(inner: list[Array], second, bias, start, length: int) -> Array:
