@@ -5,6 +5,7 @@ embedding: bfloat16 has 0.3 m for a place at 70 m.
 """
 
 import dataclasses
+import itertools
 from typing import Any
 
 import flax.linen as nn
@@ -15,8 +16,9 @@ from jaxtyping import Array, Bool, Float
 from scenefactory_jax.core import pallas
 from scenefactory_jax.core.schema import ConfigError, Count
 from scenefactory_jax.learning.networks import attention_kernel
+from scenefactory_jax.learning.networks.embedding_kernel import embed
 from scenefactory_jax.learning.networks.heads import lecun_uniform
-from scenefactory_jax.learning.networks.late_fusion import pool
+from scenefactory_jax.learning.networks.late_fusion import Affine, pool
 from scenefactory_jax.learning.networks.observation_blocks import Blocks
 
 Tokens = tuple[Array, Array]  # [B, T, D] and their mask [B, T]
@@ -45,17 +47,15 @@ def dense(width: int, dtype: Any, *, use_bias: bool = True, name: str | None = N
 
 
 class Embedding(nn.Module):
-    """Dense layers with ReLU between them and none after the last."""
+    """Dense layers with ReLU between them and none after the last, see `embedding_kernel`."""
 
     widths: tuple[int, ...]
     dtype: str
 
     @nn.compact
     def __call__(self, x: Float[Array, "*batch F"]) -> Float[Array, "*batch D"]:
-        for index, width in enumerate(self.widths):
-            x = jax.nn.relu(x.astype(self.dtype)) if index else x
-            x = dense(width, self.dtype if index else jnp.float32, name=f"layer_{index}")(x)
-        return x
+        pairs = itertools.pairwise((x.shape[-1], *self.widths))
+        return embed(self.dtype, [Affine(*pair, lecun_uniform, name=f"layer_{index}")() for index, pair in enumerate(pairs)], x)
 
 
 class Tokenizer(nn.Module):

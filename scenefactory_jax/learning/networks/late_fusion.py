@@ -182,10 +182,11 @@ class Affine(nn.Module):
 
     inputs: int
     outputs: int
+    kernel_init: Callable = nn.initializers.lecun_normal()
 
     @nn.compact
     def __call__(self) -> tuple[Float[Array, "inputs outputs"], Float[Array, " outputs"]]:
-        kernel = self.param("kernel", nn.initializers.lecun_normal(), (self.inputs, self.outputs), jnp.float32)
+        kernel = self.param("kernel", self.kernel_init, (self.inputs, self.outputs), jnp.float32)
         return kernel, self.param("bias", nn.initializers.zeros, (self.outputs,), jnp.float32)
 
 
