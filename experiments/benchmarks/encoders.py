@@ -62,7 +62,8 @@ def make_programs(actor: heads.Network) -> dict[str, Callable[[Any, Observation]
 
 def count_flops(program: Callable, *arguments: Any) -> float:
     """FLOPs of a program by XLA's cost analysis, as it is lowered for a CPU."""
-    cost: Any = jax.jit(program).trace(*arguments).lower(lowering_platforms=("cpu",)).cost_analysis()
+    with jax.default_device(jax.local_devices(backend="cpu")[0]):  # a program of another platform than the default has no analysis
+        cost: Any = jax.jit(program).lower(*jax.eval_shape(lambda *leaves: leaves, *arguments)).cost_analysis()
     return float((cost[0] if isinstance(cost, list) else cost)["flops"])
 
 
@@ -87,7 +88,7 @@ def measure(numbers: argparse.Namespace) -> list[dict[str, Any]]:
         config = hydra_config.load_config("train", "policy=actor_critic", f"policy/encoder={name}", *numbers.overrides)
         counted = make_programs(make_actor(config, numbers.dtype))
         if "transformer" in config["policy"]["encoder"]:
-            config["policy"]["encoder"]["transformer"]["implementation"] = numbers.implementation
+            config["policy"]["encoder"]["transformer"]["kernels"] = numbers.kernels
         actor = make_actor(config, numbers.dtype)
         one = make_observation(jax.random.key(0), shapes, 1)
         parameters = jax.jit(actor.init)(jax.random.key(1), one)
@@ -139,7 +140,7 @@ def main(arguments: list[str] | None = None) -> list[dict[str, Any]]:
     parser.add_argument("--encoders", nargs="+", default=ENCODERS, choices=ENCODERS)
     parser.add_argument("--batches", nargs="+", type=int, default=BATCHES)
     parser.add_argument("--dtype", default="float32", choices=["float32", "bfloat16"])
-    parser.add_argument("--implementation", default="xla", choices=["xla", "cudnn"], help="of attention")
+    parser.add_argument("--plain", dest="kernels", action="store_false", help="without the kernels of attention")
     parser.add_argument("--peak-tflops", type=float, help="of the device, for products of that dtype")
     parser.add_argument("--repeats", type=int, default=10)
     parser.add_argument("--out", type=Path)

@@ -211,8 +211,6 @@ def test_mistakes_are_named():
         heads.make_encoder({"_target_": "perceiver"}, observations={}, dtype="float32")
     with pytest.raises(ConfigError, match=r"policy\.encoder\.keys: .* mtr needs one of others, neighbours; the observation has ego, road"):
         init("mtr", {name: group for name, group in observe(0).items() if name != "neighbours"})
-    with pytest.raises(ConfigError, match=r"policy\.encoder\.transformer\.implementation: cudnn needs policy\.dtype=bfloat16, got float32"):
-        init("lq", observe(0), transformer={**encoding.SMALL, "implementation": "cudnn"})
     with pytest.raises(ConfigError, match=r"policy\.encoder\.transformer\.embedding: expected one width or more"):
         init("lq", observe(0), transformer={**encoding.SMALL, "embedding": []})
     with pytest.raises(ConfigError, match=r"observations\.vmax: its block 'ego' has the name of another group"):

@@ -5,16 +5,18 @@ embedding: bfloat16 has 0.3 m for a place at 70 m.
 """
 
 import dataclasses
-from typing import Any, Literal
+from typing import Any
 
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
+from scenefactory_jax.core import pallas
 from scenefactory_jax.core.schema import ConfigError, Count
+from scenefactory_jax.learning.networks import attention_kernel
 from scenefactory_jax.learning.networks.heads import lecun_uniform
-from scenefactory_jax.learning.networks.late_fusion import pool
+from scenefactory_jax.learning.networks.late_fusion import Affine, pool
 from scenefactory_jax.learning.networks.observation_blocks import Blocks
 
 Tokens = tuple[Array, Array]  # [B, T, D] and their mask [B, T]
@@ -30,7 +32,7 @@ class Transformer:
     heads: Count
     head_features: Count
     feed_forward: Count  # hidden width of a feed-forward part, in widths of its input
-    implementation: Literal["xla", "cudnn"]  # of jax.nn.dot_product_attention
+    kernels: bool  # Triton kernels on NVIDIA GPUs, where they fit
 
     def __post_init__(self) -> None:
         if not self.embedding:
@@ -92,9 +94,9 @@ def join_tokens(tokens: dict[str, Tokens]) -> Tokens:
 
 
 class Attention(nn.Module):
-    """Multi-head attention of queries [B, T, width] to keys and values that `project` computes; returns the change of the queries.
+    """Multi-head attention of queries [B, T, width] to keys and values that `project` computes.
 
-    Queries that have no valid key get the bias of the last layer.
+    Returns what all heads found, zeros for a query without a valid key; `out` has the weights of the layer behind.
     """
 
     width: int
@@ -107,7 +109,7 @@ class Attention(nn.Module):
         self.query = dense(inner, self.dtype, use_bias=self.query_bias)
         self.key = dense(inner, self.dtype, use_bias=False)
         self.value = dense(inner, self.dtype, use_bias=False)
-        self.out = dense(self.width, self.dtype)
+        self.out = Affine(inner, self.width, lecun_uniform)
 
     def project(self, x: Float[Array, "B S D"]) -> tuple[Float[Array, "B S H E"], Float[Array, "B S H E"]]:
         """Computes keys and values of tokens."""
@@ -115,29 +117,67 @@ class Attention(nn.Module):
 
     def __call__(
         self, x: Float[Array, "B T D"], keys_values: tuple[Array, Array], mask: Bool[Array, "B #T S"] | None = None
-    ) -> Float[Array, "B T D"]:
+    ) -> Float[Array, "B T C"]:
         keys, values = keys_values
-        heads = None if mask is None else mask[:, None]
         queries = self._split(self.query(x))
-        found = jax.nn.dot_product_attention(queries, keys, values, mask=heads, implementation=self.numbers.implementation)
-        if mask is not None:
-            found = jnp.where(jnp.any(mask, axis=-1)[..., None, None], found, 0)
-        return self.out(found.reshape(*x.shape[:-1], -1)).astype(jnp.float32)
+        mask = jnp.ones((*keys.shape[:1], 1, keys.shape[1]), bool) if mask is None else mask
+        if self.numbers.kernels and mask.shape[1] == 1 and attention_kernel.fits(queries):
+            found = attend(queries, keys, values, mask[:, 0])
+        else:
+            found = attend_plainly(queries, keys, values, mask)
+        return found.reshape(*x.shape[:-1], -1)
 
     def _split(self, x: Float[Array, "B T C"]) -> Float[Array, "B T H E"]:
         return x.reshape(*x.shape[:-1], self.numbers.heads, self.numbers.head_features)
 
 
+def attend_plainly(
+    queries: Float[Array, "B T H E"], keys: Float[Array, "B S H E"], values: Float[Array, "B S H E"], mask: Bool[Array, "B #T S"]
+) -> Float[Array, "B T H E"]:
+    """Computes the attention in plain JAX, zeros for a query without a valid key."""
+    found = jax.nn.dot_product_attention(queries, keys, values, mask=mask[:, None])
+    return jnp.where(jnp.any(mask, axis=-1)[..., None, None], found, 0)
+
+
+@jax.custom_vjp
+def attend(
+    queries: Float[Array, "B T H E"], keys: Float[Array, "B S H E"], values: Float[Array, "B S H E"], mask: Bool[Array, "B S"]
+) -> Float[Array, "B T H E"]:
+    """Computes the same, by a kernel on NVIDIA GPUs; all queries of a sample have one mask. Forward-mode differentiation is not defined."""
+    return _attend_forward(queries, keys, values, mask)[0]
+
+
+def _attend_forward(queries: Array, keys: Array, values: Array, mask: Array) -> tuple[Array, tuple]:
+    def plain(queries: Array, keys: Array, values: Array, mask: Array) -> tuple[Array, Array]:
+        batch, count, heads, _ = queries.shape
+        return attend_plainly(queries, keys, values, mask[:, None]), jnp.zeros((batch, heads, count), jnp.float32)
+
+    found, total = pallas.on_gpu(attention_kernel.attend, plain, queries, keys, values, mask)
+    return found, (queries, keys, values, mask, found, total)
+
+
+def _attend_backward(residuals: tuple, cotangent: Array) -> tuple[Array, Array, Array, None]:
+    def plain(queries: Array, keys: Array, values: Array, mask: Array, found: Array, total: Array, cotangent: Array) -> tuple:
+        return jax.vjp(lambda *of: attend_plainly(*of, mask[:, None]), queries, keys, values)[1](cotangent)
+
+    return *pallas.on_gpu(attention_kernel.gradient, plain, *residuals, cotangent), None
+
+
+attend.defvjp(_attend_forward, _attend_backward)
+
+
 class FeedForward(nn.Module):
-    """A dense layer, GELU, and a dense layer back to the width of the input."""
+    """Weights of a feed-forward part, see `residual.add`: a dense layer, and a dense layer back."""
 
-    multiple: int  # of the input's width, which is the hidden one
-    dtype: str
+    width: int
+    multiple: int  # of the width, which is the hidden one
 
-    @nn.compact
-    def __call__(self, x: Float[Array, "B T D"]) -> Float[Array, "B T D"]:
-        hidden = dense(x.shape[-1] * self.multiple, self.dtype, name="hidden")(x)
-        return dense(x.shape[-1], self.dtype, name="out")(jax.nn.gelu(hidden)).astype(jnp.float32)
+    def setup(self) -> None:
+        self.hidden = Affine(self.width, self.width * self.multiple, lecun_uniform)
+        self.out = Affine(self.width * self.multiple, self.width, lecun_uniform)
+
+    def __call__(self) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
+        return self.hidden(), self.out()
 
 
 def select_nearest_keys(

@@ -7,7 +7,7 @@ as a key of a query that has no other, nor in the mean of MTR.
 import functools
 from typing import Literal
 
-from scenefactory_jax.core.schema import ConfigError, Count
+from scenefactory_jax.core.schema import Count
 from scenefactory_jax.learning.networks import encoder_modules as modules
 from scenefactory_jax.learning.networks.attention import Transformer
 from scenefactory_jax.learning.networks.heads import Encoder
@@ -55,13 +55,11 @@ def lq(*, transformer: Transformer, latents: Count, width: Count, rounds: Count,
         width: of a latent, and of the feature.
         rounds: of attention to the tokens and to themselves.
     """
-    _check(transformer, dtype)
     return functools.partial(modules.LatentQuery, read, transformer, dtype, latents, width, rounds)
 
 
 def lqh(*, transformer: Transformer, latents: Count, width: Count, read: Reader, dtype: Dtype) -> Encoder:
     """Hierarchical latent queries (arXiv:2210.09539): latents attend to one block after the other. Arguments as of `lq`."""
-    _check(transformer, dtype)
     return functools.partial(modules.HierarchicalLatentQuery, read, transformer, dtype, latents, width)
 
 
@@ -74,7 +72,6 @@ def mtr(*, transformer: Transformer, layers: Count, nearest: Count, keys: list[s
         nearest: road users that a token attends to.
         keys: names of the blocks of road users; the observation must have one of them.
     """
-    _check(transformer, dtype)
     return functools.partial(modules.MotionTransformer, read, transformer, dtype, layers, nearest, tuple(keys))
 
 
@@ -84,10 +81,4 @@ def wayformer(*, transformer: Transformer, latents: Count, width: Count, depth: 
     Args:
         depth: attentions of each block, of which the first is to its tokens; the others as of `lq`.
     """
-    _check(transformer, dtype)
     return functools.partial(modules.Wayformer, read, transformer, dtype, latents, width, depth)
-
-
-def _check(transformer: Transformer, dtype: str) -> None:
-    if transformer.implementation == "cudnn" and dtype != "bfloat16":
-        raise ConfigError(f"policy.encoder.transformer.implementation: cudnn needs policy.dtype=bfloat16, got {dtype}")

@@ -175,14 +175,15 @@ class Layers(nn.Module):
 
 
 class Affine(nn.Module):
-    """Kernel and bias of one dense layer, initialised as `flax.linen.Dense` does."""
+    """Kernel and bias of one dense layer, initialised as `flax.linen.Dense` does by default."""
 
     inputs: int
     outputs: int
+    kernel_init: Callable = nn.initializers.lecun_normal()
 
     @nn.compact
     def __call__(self) -> tuple[Float[Array, "inputs outputs"], Float[Array, " outputs"]]:
-        kernel = self.param("kernel", nn.initializers.lecun_normal(), (self.inputs, self.outputs), jnp.float32)
+        kernel = self.param("kernel", self.kernel_init, (self.inputs, self.outputs), jnp.float32)
         return kernel, self.param("bias", nn.initializers.zeros, (self.outputs,), jnp.float32)
 
 

@@ -1,0 +1,169 @@
+"""Triton kernels, through Pallas, of what follows the search of an attention: its output layer and a feed-forward part, with ReZero.
+
+    middle = x + scale * (found @ out + bias),   y = middle + scale * (gelu(middle @ hidden + bias) @ back + bias)
+
+Plain JAX writes what is between the products to memory, some ten times the numbers of x. Here one program computes a tile of rows, and the
+hidden width in chunks; the gradient computes it anew, and writes the operands of the weights' gradients, which are three large products.
+
+Products are of numbers in `dtype`, float32 numbers in TF32; sums and what is between the products are float32.
+"""
+
+import functools
+import math
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jax.experimental import pallas as pl
+from jax.experimental.pallas import triton as plgpu
+from jaxtyping import Array, Float
+
+from scenefactory_jax.core import pallas
+
+ROWS, CHUNK = 64, 64  # of a program, and hidden width at a time; both are halved as long as they do not divide their axis
+LEAST, MOST = 16, 128  # of a width or of rows: the minimum of the matrix units, and what the registers hold
+CUBIC, STEEP = 0.044715, 2.0 * math.sqrt(2.0 / math.pi)  # of the approximation of GELU, x * sigmoid(STEEP * (x + CUBIC * x^3))
+
+Weights = tuple[tuple[Array, Array], ...]
+"""Kernel and bias of the output layer [C, D], of the hidden layer [D, H], and of the layer back [H, D]."""
+
+
+def fits(x: Float[Array, "*batch D"], found: Float[Array, "*batch C"], weights: Weights) -> bool:
+    """Whether the kernels can compute these: widths of a power of two from 16 to 128, multiples of 16 rows and hidden values."""
+    narrow = all(LEAST <= width <= MOST and width & (width - 1) == 0 for width in (x.shape[-1], found.shape[-1]))
+    return narrow and min(math.gcd(math.prod(x.shape[:-1]), ROWS), math.gcd(weights[1][0].shape[1], CHUNK)) >= LEAST
+
+
+def add(
+    dtype: str,
+    x: Float[Array, "*batch D"],
+    found: Float[Array, "*batch C"],
+    scale: Float[Array, ""],
+    weights: Weights,
+    *,
+    rows: int = ROWS,
+    chunk: int = CHUNK,
+    warps: int = 4,
+    stages: int = 1,
+    interpret: bool = False,
+) -> Float[Array, "*batch D"]:
+    """Computes y.
+
+    Args:
+        dtype: of the products.
+        rows, chunk: at most, see `ROWS`.
+        warps, stages: of a program, see Triton.
+        interpret: run on any device, slowly.
+    """
+    tiles, shared = _divide(rows, x, found.astype(dtype)), _prepare(dtype, scale, weights)
+    y = pl.pallas_call(
+        functools.partial(_add, chunk=math.gcd(weights[1][0].shape[1], chunk)),
+        grid=(len(tiles[0]),),
+        in_specs=[*map(pallas.row, tiles), *map(pallas.whole, shared)],
+        out_specs=pallas.row(tiles[0]),
+        out_shape=jax.ShapeDtypeStruct(tiles[0].shape, jnp.float32),
+        compiler_params=plgpu.CompilerParams(num_warps=warps, num_stages=stages),
+        interpret=interpret,
+        name="add_residual",
+    )(*tiles, *shared)
+    return y.reshape(x.shape)
+
+
+def _add(x, found, scale, out, out_bias, hidden, hidden_bias, back, back_bias, y, *, chunk: int) -> None:
+    middle = x[...] + scale[0] * (pallas.product(found[...], out[...]) + out_bias[...][None])
+    rounded = middle.astype(out.dtype)
+
+    def step(index, sums):
+        part = pl.ds(index * chunk, chunk)
+        before = pallas.product(rounded, hidden[:, part]) + hidden_bias[part][None]
+        return sums + pallas.product((before * _gate(before)).astype(back.dtype), back[part, :])
+
+    sums = jax.lax.fori_loop(0, hidden.shape[1] // chunk, step, jnp.zeros(middle.shape, jnp.float32))
+    y[...] = middle + scale[0] * (sums + back_bias[...][None])
+
+
+def gradient(
+    dtype: str,
+    x: Float[Array, "*batch D"],
+    found: Float[Array, "*batch C"],
+    scale: Float[Array, ""],
+    weights: Weights,
+    cotangent: Float[Array, "*batch D"],
+    *,
+    rows: int = ROWS,
+    chunk: int = CHUNK,
+    warps: int = 4,
+    stages: int = 1,
+    interpret: bool = False,
+) -> tuple[Array, Array, Array, Weights]:
+    """Computes the gradients of x, found, scale and weights from the cotangent of y. Arguments as of `add`."""
+    tiles, shared = _divide(rows, x, found.astype(dtype), cotangent), _prepare(dtype, scale, weights)
+    (count, rows, width), inner = tiles[0].shape, weights[1][0].shape[1]
+    like = lambda width, dtype: jax.ShapeDtypeStruct((count, rows, width), dtype)  # noqa: E731
+    blank = [like(width, jnp.float32), like(found.shape[-1], found.dtype), *(like(w, dtype) for w in (width, width, width, inner, inner))]
+    blank.append(jax.ShapeDtypeStruct((count, inner + 2 * width + 1), jnp.float32))
+    *results, sums = pl.pallas_call(
+        functools.partial(_gradient, chunk=math.gcd(inner, chunk)),
+        grid=(count,),
+        in_specs=[*map(pallas.row, tiles), *map(pallas.whole, shared)],
+        out_specs=[*map(pallas.row, blank)],
+        out_shape=blank,
+        compiler_params=plgpu.CompilerParams(num_warps=warps, num_stages=stages),
+        interpret=interpret,
+        name="add_residual_gradient",
+    )(*tiles, *shared)
+    of_x, of_found, pull, middle, pull_middle, after, slope = (part.reshape(-1, part.shape[-1]) for part in results)
+    sums = jnp.sum(sums, axis=0)
+    of_hidden_bias, of_y, of_middle = sums[:inner], sums[inner : inner + width], sums[inner + width : -1]
+    of_scale = sums[-1] + of_y @ weights[2][1] + of_middle @ weights[0][1]
+    by_rows = functools.partial(jnp.einsum, "ri,rj->ij", preferred_element_type=jnp.float32)
+    of_out = scale * by_rows(tiles[1].reshape(len(middle), -1), pull_middle), scale * of_middle
+    of_weights = of_out, (by_rows(middle, slope), of_hidden_bias), (scale * by_rows(after, pull), scale * of_y)
+    return of_x.reshape(x.shape), of_found.reshape(found.shape), of_scale, of_weights
+
+
+def _gradient(
+    x, found, cotangent, scale, out, out_bias, hidden, hidden_bias, back, back_bias,
+    of_x, of_found, low_pull, low_middle, low_of_x, low_after, low_slope, sums, *, chunk: int,
+) -> None:  # fmt: skip
+    del back_bias
+    (rows, width), inner = x.shape, hidden.shape[1]
+    middle = (x[...] + scale[0] * (pallas.product(found[...], out[...]) + out_bias[...][None])).astype(out.dtype)
+    pull = cotangent[...].astype(out.dtype)
+    low_middle[...], low_pull[...] = middle, pull
+
+    def step(index, carry):
+        total, along = carry
+        part = pl.ds(index * chunk, chunk)
+        before = pallas.product(middle, hidden[:, part]) + hidden_bias[part][None]
+        gate = _gate(before)
+        after, pulled = before * gate, pallas.product(pull, back[part, :], over=1)
+        steep = gate + after * (1.0 - gate) * STEEP * (1.0 + 3.0 * CUBIC * before * before)
+        slope = scale[0] * pulled * steep
+        sums[part] = jnp.sum(slope, axis=0)
+        low_after[:, part], low_slope[:, part] = after.astype(out.dtype), slope.astype(out.dtype)
+        return total + pallas.product(slope.astype(out.dtype), hidden[:, part], over=1), along + jnp.sum(after * pulled, axis=1)
+
+    begin = cotangent[...], jnp.zeros(rows, jnp.float32)
+    total, along = jax.lax.fori_loop(0, inner // chunk, step, begin)
+    of_x[...], low_of_x[...] = total, total.astype(out.dtype)
+    pulled = pallas.product(total.astype(out.dtype), out[...], over=1)
+    of_found[...] = (scale[0] * pulled).astype(of_found.dtype)
+    sums[pl.ds(inner, width)], sums[pl.ds(inner + width, width)] = jnp.sum(cotangent[...], axis=0), jnp.sum(total, axis=0)
+    sums[inner + 2 * width] = jnp.sum(along + jnp.sum(found[...].astype(jnp.float32) * pulled, axis=1))
+
+
+def _gate(x: Array) -> Array:
+    """The factor of x in GELU."""
+    return 1.0 / (1.0 + jnp.exp(-STEEP * (x + CUBIC * x * x * x)))
+
+
+def _divide(rows: int, *arrays: Array) -> list[Array]:
+    """Divides rows into tiles [tiles, rows, width]."""
+    rows = math.gcd(math.prod(arrays[0].shape[:-1]), rows)
+    return [x.reshape(-1, rows, x.shape[-1]) for x in arrays]
+
+
+def _prepare(dtype: str, scale: Array, weights: Weights) -> list[Any]:
+    """What every program reads: the scale, then kernels, rounded, and biases."""
+    return [scale.reshape(1), *(part for kernel, bias in weights for part in (kernel.astype(dtype), bias))]
