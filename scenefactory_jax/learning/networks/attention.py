@@ -5,6 +5,7 @@ embedding: bfloat16 has 0.3 m for a place at 70 m.
 """
 
 import dataclasses
+import functools
 from typing import Any
 
 import flax.linen as nn
@@ -158,7 +159,7 @@ def _attend_forward(queries: Array, keys: Array, values: Array, mask: Array) -> 
 
 def _attend_backward(residuals: tuple, cotangent: Array) -> tuple[Array, Array, Array, None]:
     def plain(queries: Array, keys: Array, values: Array, mask: Array, found: Array, total: Array, cotangent: Array) -> tuple:
-        return jax.vjp(lambda *of: attend_plainly(*of, mask[:, None]), queries, keys, values)[1](cotangent)
+        return jax.vjp(functools.partial(attend_plainly, mask=mask[:, None]), queries, keys, values)[1](cotangent)
 
     return *pallas.on_gpu(attention_kernel.gradient, plain, *residuals, cotangent), None
 

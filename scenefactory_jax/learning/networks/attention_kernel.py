@@ -15,7 +15,7 @@ from jaxtyping import Array, Bool, Float
 
 from scenefactory_jax.core import pallas
 
-KEYS, FEW = 64, 16  # of a block; where there are no more keys than `FEW`
+KEYS, FEW = 32, 16  # of a block; where there are no more keys than `FEW`
 QUERIES, FEATURES = (16, 32, 64), (16, 32, 64)  # that fit: sizes of the matrix units, and what the registers hold
 NONE = -1e30  # logit of a key that does not count
 

@@ -44,7 +44,7 @@ def add(
     rows: int = ROWS,
     chunk: int = CHUNK,
     warps: int = 4,
-    stages: int = 1,
+    stages: int = 2,
     interpret: bool = False,
 ) -> Float[Array, "*batch D"]:
     """Computes y.
@@ -93,7 +93,7 @@ def gradient(
     rows: int = ROWS,
     chunk: int = CHUNK,
     warps: int = 4,
-    stages: int = 1,
+    stages: int = 2,
     interpret: bool = False,
 ) -> tuple[Array, Array, Array, Weights]:
     """Computes the gradients of x, found, scale and weights from the cotangent of y. Arguments as of `add`."""
