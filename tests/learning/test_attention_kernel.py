@@ -65,8 +65,9 @@ def test_residual_parts_are_the_plain_ones_with_their_gradient(dtype, tolerance)
     found = found.astype(dtype)
     [cotangent] = draw(9, x.shape)
     wanted, pull = jax.vjp(functools.partial(residual.add_plainly, dtype), x, found, scale, weights)
-    compare(jax.jit(interpreted(residual_kernel.add, dtype))(x, found, scale, weights), wanted, tolerance)
-    gradient = jax.jit(interpreted(residual_kernel.gradient, dtype))(x, found, scale, weights, cotangent)
+    y, middle = jax.jit(interpreted(residual_kernel.add, dtype))(x, found, scale, weights)
+    compare(y, wanted, tolerance)
+    gradient = jax.jit(interpreted(residual_kernel.gradient, dtype))(x, found, scale, weights, middle, cotangent)
     compare(gradient, pull(cotangent), tolerance)
     assert [leaf.dtype for leaf in jax.tree.leaves(gradient)] == [leaf.dtype for leaf in jax.tree.leaves((x, found, scale, weights))]
 
@@ -74,8 +75,9 @@ def test_residual_parts_are_the_plain_ones_with_their_gradient(dtype, tolerance)
 def test_residual_parts_begin_as_nothing_and_have_a_gradient_of_their_scale():
     x, found, _, weights = residuals(0)
     none = jnp.float32(0.0)
-    np.testing.assert_array_equal(residual_kernel.add("float32", x, found, none, weights, interpret=True), x)
-    gradient = residual_kernel.gradient("float32", x, found, none, weights, x, interpret=True)
+    y, middle = residual_kernel.add("float32", x, found, none, weights, interpret=True)
+    np.testing.assert_array_equal(y, x)
+    gradient = residual_kernel.gradient("float32", x, found, none, weights, middle, x, interpret=True)
     compare(gradient, jax.vjp(functools.partial(residual.add_plainly, "float32"), x, found, none, weights)[1](x), 1e-5)
     assert gradient[2] != 0.0
 
@@ -83,9 +85,13 @@ def test_residual_parts_begin_as_nothing_and_have_a_gradient_of_their_scale():
 def test_kernels_work_under_vmap_over_parameters():
     x, found, scale, weights = residuals(0, batch=(2, 2))
     scales, many = jnp.stack([scale, -scale]), jax.tree.map(lambda leaf: jnp.stack([leaf, 2.0 * leaf]), weights)
-    kernel = functools.partial(residual_kernel.gradient, "float32", interpret=True)
-    together = jax.jit(jax.vmap(kernel, in_axes=(0, None, 0, 0, None)))(x, found[0], scales, many, x[0])
-    one = kernel(x[1], found[0], scales[1], jax.tree.map(lambda leaf: leaf[1], many), x[0])
+
+    def kernels(*arguments):
+        y, middle = residual_kernel.add("float32", *arguments, interpret=True)
+        return residual_kernel.gradient("float32", *arguments, middle, y, interpret=True)
+
+    together = jax.jit(jax.vmap(kernels, in_axes=(0, None, 0, 0)))(x, found[0], scales, many)
+    one = kernels(x[1], found[0], scales[1], jax.tree.map(lambda leaf: leaf[1], many))
     compare(jax.tree.map(lambda leaf: leaf[1], together), one, 1e-5)
 
     (queries, keys, values), mask = heads(0, 16)

@@ -51,16 +51,20 @@ def _add(dtype: str, x: Array, found: Array, scale: Array, weights: Weights) -> 
     return _add_forward(dtype, x, found, scale, weights)[0]
 
 
-def _add_forward(dtype: str, *arguments: Any) -> tuple[Array, tuple]:
-    quick, plain = (functools.partial(function, dtype) for function in (residual_kernel.add, add_plainly))
-    return pallas.on_gpu(quick, plain, *arguments), arguments
+def _add_forward(dtype: str, x: Array, found: Array, scale: Array, weights: Weights) -> tuple[Array, tuple]:
+    def plain(x: Array, *others: Any) -> tuple[Array, Array]:
+        return add_plainly(dtype, x, *others), jnp.zeros_like(x, dtype)  # nobody reads them
+
+    y, middle = pallas.on_gpu(functools.partial(residual_kernel.add, dtype), plain, x, found, scale, weights)
+    return y, (x, found, scale, weights, middle)
 
 
-def _add_backward(dtype: str, arguments: tuple, cotangent: Array) -> tuple:
-    def plain(*operands: Any) -> tuple:
-        return jax.vjp(functools.partial(add_plainly, dtype), *operands[:-1])[1](operands[-1])
+def _add_backward(dtype: str, residuals: tuple, cotangent: Array) -> tuple:
+    def plain(x: Array, found: Array, scale: Array, weights: Weights, middle: Array, cotangent: Array) -> tuple:
+        del middle
+        return jax.vjp(functools.partial(add_plainly, dtype), x, found, scale, weights)[1](cotangent)
 
-    return pallas.on_gpu(functools.partial(residual_kernel.gradient, dtype), plain, *arguments, cotangent)
+    return pallas.on_gpu(functools.partial(residual_kernel.gradient, dtype), plain, *residuals, cotangent)
 
 
 _add.defvjp(_add_forward, _add_backward)

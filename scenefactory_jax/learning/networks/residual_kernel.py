@@ -3,7 +3,8 @@
     middle = x + scale * (found @ out + bias),   y = middle + scale * (gelu(middle @ hidden + bias) @ back + bias)
 
 Plain JAX writes what is between the products to memory, some ten times the numbers of x. Here one program computes a tile of rows, and the
-hidden width in chunks; the gradient computes it anew, and writes the operands of the weights' gradients, which are three large products.
+hidden width in chunks; the gradient computes it anew from the middle, and writes the operands of the weights' gradients, which are three
+large products.
 
 Products are of numbers in `dtype`, float32 numbers in TF32; sums and what is between the products are float32.
 """
@@ -46,8 +47,8 @@ def add(
     warps: int = 4,
     stages: int = 2,
     interpret: bool = False,
-) -> Float[Array, "*batch D"]:
-    """Computes y.
+) -> tuple[Float[Array, "*batch D"], Float[Array, "*batch D"]]:
+    """Computes y, and the middle in `dtype`.
 
     Args:
         dtype: of the products.
@@ -56,22 +57,23 @@ def add(
         interpret: run on any device, slowly.
     """
     tiles, shared = _divide(rows, x, found.astype(dtype)), _prepare(dtype, scale, weights)
-    y = pl.pallas_call(
+    results = pl.pallas_call(
         functools.partial(_add, chunk=math.gcd(weights[1][0].shape[1], chunk)),
         grid=(len(tiles[0]),),
         in_specs=[*map(pallas.row, tiles), *map(pallas.whole, shared)],
-        out_specs=pallas.row(tiles[0]),
-        out_shape=jax.ShapeDtypeStruct(tiles[0].shape, jnp.float32),
+        out_specs=[pallas.row(tiles[0])] * 2,
+        out_shape=[jax.ShapeDtypeStruct(tiles[0].shape, kind) for kind in (jnp.float32, dtype)],
         compiler_params=plgpu.CompilerParams(num_warps=warps, num_stages=stages),
         interpret=interpret,
         name="add_residual",
     )(*tiles, *shared)
-    return y.reshape(x.shape)
+    y, middle = (part.reshape(x.shape) for part in results)
+    return y, middle
 
 
-def _add(x, found, scale, out, out_bias, hidden, hidden_bias, back, back_bias, y, *, chunk: int) -> None:
+def _add(x, found, scale, out, out_bias, hidden, hidden_bias, back, back_bias, y, low_middle, *, chunk: int) -> None:
     middle = x[...] + scale[0] * (pallas.product(found[...], out[...]) + out_bias[...][None])
-    rounded = middle.astype(out.dtype)
+    low_middle[...] = rounded = middle.astype(out.dtype)
 
     def step(index, sums):
         part = pl.ds(index * chunk, chunk)
@@ -88,6 +90,7 @@ def gradient(
     found: Float[Array, "*batch C"],
     scale: Float[Array, ""],
     weights: Weights,
+    middle: Float[Array, "*batch D"],
     cotangent: Float[Array, "*batch D"],
     *,
     rows: int = ROWS,
@@ -96,11 +99,12 @@ def gradient(
     stages: int = 2,
     interpret: bool = False,
 ) -> tuple[Array, Array, Array, Weights]:
-    """Computes the gradients of x, found, scale and weights from the cotangent of y. Arguments as of `add`."""
-    tiles, shared = _divide(rows, x, found.astype(dtype), cotangent), _prepare(dtype, scale, weights)
+    """Computes the gradients of x, found, scale and weights from what `add` returned and the cotangent of y. Arguments as of `add`."""
+    del x  # the gradient does not depend on it
+    tiles, shared = _divide(rows, middle, found.astype(dtype), cotangent), _prepare(dtype, scale, weights)
     (count, rows, width), inner = tiles[0].shape, weights[1][0].shape[1]
     like = lambda width, dtype: jax.ShapeDtypeStruct((count, rows, width), dtype)  # noqa: E731
-    blank = [like(width, jnp.float32), like(found.shape[-1], found.dtype), *(like(w, dtype) for w in (width, width, width, inner, inner))]
+    blank = [like(width, jnp.float32), like(found.shape[-1], found.dtype), *(like(w, dtype) for w in (width, width, inner, inner))]
     blank.append(jax.ShapeDtypeStruct((count, inner + 2 * width + 1), jnp.float32))
     *results, sums = pl.pallas_call(
         functools.partial(_gradient, chunk=math.gcd(inner, chunk)),
@@ -112,25 +116,24 @@ def gradient(
         interpret=interpret,
         name="add_residual_gradient",
     )(*tiles, *shared)
-    of_x, of_found, pull, middle, pull_middle, after, slope = (part.reshape(-1, part.shape[-1]) for part in results)
+    flat = [part.reshape(-1, part.shape[-1]) for part in (*tiles, *results)]
+    middle_rows, found_rows, _, of_x, of_found, pull, pull_middle, after, slope = flat
     sums = jnp.sum(sums, axis=0)
     of_hidden_bias, of_y, of_middle = sums[:inner], sums[inner : inner + width], sums[inner + width : -1]
     of_scale = sums[-1] + of_y @ weights[2][1] + of_middle @ weights[0][1]
     by_rows = functools.partial(jnp.einsum, "ri,rj->ij", preferred_element_type=jnp.float32)
-    of_out = scale * by_rows(tiles[1].reshape(len(middle), -1), pull_middle), scale * of_middle
-    of_weights = of_out, (by_rows(middle, slope), of_hidden_bias), (scale * by_rows(after, pull), scale * of_y)
-    return of_x.reshape(x.shape), of_found.reshape(found.shape), of_scale, of_weights
+    of_out = scale * by_rows(found_rows, pull_middle), scale * of_middle
+    of_weights = of_out, (by_rows(middle_rows, slope), of_hidden_bias), (scale * by_rows(after, pull), scale * of_y)
+    return of_x.reshape(cotangent.shape), of_found.reshape(found.shape), of_scale, of_weights
 
 
 def _gradient(
-    x, found, cotangent, scale, out, out_bias, hidden, hidden_bias, back, back_bias,
-    of_x, of_found, low_pull, low_middle, low_of_x, low_after, low_slope, sums, *, chunk: int,
+    middle, found, cotangent, scale, out, out_bias, hidden, hidden_bias, back, back_bias,
+    of_x, of_found, low_pull, low_of_x, low_after, low_slope, sums, *, chunk: int,
 ) -> None:  # fmt: skip
-    del back_bias
-    (rows, width), inner = x.shape, hidden.shape[1]
-    middle = (x[...] + scale[0] * (pallas.product(found[...], out[...]) + out_bias[...][None])).astype(out.dtype)
-    pull = cotangent[...].astype(out.dtype)
-    low_middle[...], low_pull[...] = middle, pull
+    del out_bias, back_bias
+    (rows, width), inner, middle = middle.shape, hidden.shape[1], middle[...]
+    low_pull[...] = pull = cotangent[...].astype(out.dtype)
 
     def step(index, carry):
         total, along = carry
