@@ -50,7 +50,7 @@ def compare(found, wanted, tolerance):
 def test_attention_is_the_plain_one_with_its_gradient(keys, dtype, tolerance):
     of, mask = heads(0, keys, dtype)
     [cotangent] = (x.astype(dtype) for x in draw(1, of[0].shape))
-    wanted, pull = jax.vjp(lambda *of: attention.attend_plainly(*of, mask[:, None]), *of)
+    wanted, pull = jax.vjp(functools.partial(attention.attend_plainly, mask=mask[:, None]), *of)
     found, total = jax.jit(interpreted(attention_kernel.attend))(*of, mask)
     compare(found, wanted, tolerance)
     assert not np.asarray(found[0]).any() and found.dtype == dtype
@@ -86,9 +86,9 @@ def test_kernels_work_under_vmap_over_parameters():
     x, found, scale, weights = residuals(0, batch=(2, 2))
     scales, many = jnp.stack([scale, -scale]), jax.tree.map(lambda leaf: jnp.stack([leaf, 2.0 * leaf]), weights)
 
-    def kernels(*arguments):
-        y, middle = residual_kernel.add("float32", *arguments, interpret=True)
-        return residual_kernel.gradient("float32", *arguments, middle, y, interpret=True)
+    def kernels(x, found, scale, weights):
+        y, middle = residual_kernel.add("float32", x, found, scale, weights, interpret=True)
+        return residual_kernel.gradient("float32", x, found, scale, weights, middle, y, interpret=True)
 
     together = jax.jit(jax.vmap(kernels, in_axes=(0, None, 0, 0)))(x, found[0], scales, many)
     one = kernels(x[1], found[0], scales[1], jax.tree.map(lambda leaf: leaf[1], many))
@@ -106,7 +106,7 @@ def test_kernels_work_under_vmap_over_parameters():
 def test_supported_residual_parts(sizes, made):
     x, found, _, weights = residuals(0, **sizes)
     assert residual_kernel.fits(x, found, weights) == made
-    assert not residual_kernel.fits(x[0, :8], found[0, :8], weights)
+    assert not residual_kernel.fits(x[0, :8], found[0, :8], weights) and not residual_kernel.fits(x[:0], found[:0], weights)
 
 
 @pytest.mark.parametrize("dtype", ["float32", "bfloat16"])
@@ -116,8 +116,8 @@ def test_a_gpu_gets_kernels_and_other_devices_plain_jax(dtype):
 
     def text(kernels, platform):
         def loss(scale, weights):
-            found = attention.attend if kernels else lambda *of: attention.attend_plainly(*of[:3], of[3][:, None])
-            what = found(queries * scale.astype(dtype), keys, values, mask).reshape(4, 16, 32)
+            attend = attention.attend if kernels else lambda *of, mask: attention.attend_plainly(*of, mask=mask[:, None])
+            what = attend(queries * scale.astype(dtype), keys, values, mask=mask).reshape(4, 16, 32)
             return residual.add(dtype, kernels, x, what, scale, weights).sum()
 
         with abstract_gpu():

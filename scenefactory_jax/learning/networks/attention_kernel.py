@@ -25,7 +25,7 @@ Keys = Float[Array, "B S H E"]
 
 def fits(queries: Queries) -> bool:
     """Whether the kernels can compute these queries: 16, 32 or 64 of a sample, with as many features of a head."""
-    return queries.shape[1] in QUERIES and queries.shape[3] in FEATURES
+    return len(queries) > 0 and queries.shape[1] in QUERIES and queries.shape[3] in FEATURES
 
 
 def attend(

@@ -21,7 +21,7 @@ from jaxtyping import Array, Float
 
 from scenefactory_jax.core import pallas
 
-ROWS, CHUNK = 64, 64  # of a program, and hidden width at a time; both are halved as long as they do not divide their axis
+ROWS, CHUNK = 64, 32  # of a program, and hidden width at a time; both are halved as long as they do not divide their axis
 LEAST, MOST = 16, 128  # of a width or of rows: the minimum of the matrix units, and what the registers hold
 CUBIC, STEEP = 0.044715, 2.0 * math.sqrt(2.0 / math.pi)  # of the approximation of GELU, x * sigmoid(STEEP * (x + CUBIC * x^3))
 
@@ -31,8 +31,8 @@ Weights = tuple[tuple[Array, Array], ...]
 
 def fits(x: Float[Array, "*batch D"], found: Float[Array, "*batch C"], weights: Weights) -> bool:
     """Whether the kernels can compute these: widths of a power of two from 16 to 128, multiples of 16 rows and hidden values."""
-    narrow = all(LEAST <= width <= MOST and width & (width - 1) == 0 for width in (x.shape[-1], found.shape[-1]))
-    return narrow and min(math.gcd(math.prod(x.shape[:-1]), ROWS), math.gcd(weights[1][0].shape[1], CHUNK)) >= LEAST
+    fine = all(LEAST <= width <= MOST and width & (width - 1) == 0 for width in (x.shape[-1], found.shape[-1]))
+    return fine and x.size > 0 and min(math.gcd(math.prod(x.shape[:-1]), ROWS), math.gcd(weights[1][0].shape[1], CHUNK)) >= LEAST
 
 
 def add(
@@ -42,28 +42,22 @@ def add(
     scale: Float[Array, ""],
     weights: Weights,
     *,
-    rows: int = ROWS,
-    chunk: int = CHUNK,
-    warps: int = 4,
-    stages: int = 2,
     interpret: bool = False,
 ) -> tuple[Float[Array, "*batch D"], Float[Array, "*batch D"]]:
     """Computes y, and the middle in `dtype`.
 
     Args:
         dtype: of the products.
-        rows, chunk: at most, see `ROWS`.
-        warps, stages: of a program, see Triton.
         interpret: run on any device, slowly.
     """
-    tiles, shared = _divide(rows, x, found.astype(dtype)), _prepare(dtype, scale, weights)
+    tiles, shared = _divide(x, found.astype(dtype)), _prepare(dtype, scale, weights)
     results = pl.pallas_call(
-        functools.partial(_add, chunk=math.gcd(weights[1][0].shape[1], chunk)),
+        functools.partial(_add, chunk=math.gcd(weights[1][0].shape[1], CHUNK)),
         grid=(len(tiles[0]),),
         in_specs=[*map(pallas.row, tiles), *map(pallas.whole, shared)],
         out_specs=[pallas.row(tiles[0])] * 2,
         out_shape=[jax.ShapeDtypeStruct(tiles[0].shape, kind) for kind in (jnp.float32, dtype)],
-        compiler_params=plgpu.CompilerParams(num_warps=warps, num_stages=stages),
+        compiler_params=_settings(dtype),
         interpret=interpret,
         name="add_residual",
     )(*tiles, *shared)
@@ -93,26 +87,22 @@ def gradient(
     middle: Float[Array, "*batch D"],
     cotangent: Float[Array, "*batch D"],
     *,
-    rows: int = ROWS,
-    chunk: int = CHUNK,
-    warps: int = 4,
-    stages: int = 2,
     interpret: bool = False,
 ) -> tuple[Array, Array, Array, Weights]:
     """Computes the gradients of x, found, scale and weights from what `add` returned and the cotangent of y. Arguments as of `add`."""
     del x  # the gradient does not depend on it
-    tiles, shared = _divide(rows, middle, found.astype(dtype), cotangent), _prepare(dtype, scale, weights)
+    tiles, shared = _divide(middle, found.astype(dtype), cotangent), _prepare(dtype, scale, weights)
     (count, rows, width), inner = tiles[0].shape, weights[1][0].shape[1]
     like = lambda width, dtype: jax.ShapeDtypeStruct((count, rows, width), dtype)  # noqa: E731
     blank = [like(width, jnp.float32), like(found.shape[-1], found.dtype), *(like(w, dtype) for w in (width, width, inner, inner))]
     blank.append(jax.ShapeDtypeStruct((count, inner + 2 * width + 1), jnp.float32))
     *results, sums = pl.pallas_call(
-        functools.partial(_gradient, chunk=math.gcd(inner, chunk)),
+        functools.partial(_gradient, chunk=math.gcd(inner, CHUNK)),
         grid=(count,),
         in_specs=[*map(pallas.row, tiles), *map(pallas.whole, shared)],
         out_specs=[*map(pallas.row, blank)],
         out_shape=blank,
-        compiler_params=plgpu.CompilerParams(num_warps=warps, num_stages=stages),
+        compiler_params=_settings(dtype),
         interpret=interpret,
         name="add_residual_gradient",
     )(*tiles, *shared)
@@ -143,16 +133,16 @@ def _gradient(
         after, pulled = before * gate, pallas.product(pull, back[part, :], over=1)
         steep = gate + after * (1.0 - gate) * STEEP * (1.0 + 3.0 * CUBIC * before * before)
         slope = scale[0] * pulled * steep
-        sums[part] = jnp.sum(slope, axis=0)
-        low_after[:, part], low_slope[:, part] = after.astype(out.dtype), slope.astype(out.dtype)
-        return total + pallas.product(slope.astype(out.dtype), hidden[:, part], over=1), along + jnp.sum(after * pulled, axis=1)
+        low = slope.astype(out.dtype)
+        low_after[:, part], low_slope[:, part], sums[part] = after.astype(out.dtype), low, _sum_rows(low)
+        return total + pallas.product(low, hidden[:, part], over=1), along + jnp.sum(after * pulled, axis=1)
 
     begin = cotangent[...], jnp.zeros(rows, jnp.float32)
     total, along = jax.lax.fori_loop(0, inner // chunk, step, begin)
-    of_x[...], low_of_x[...] = total, total.astype(out.dtype)
-    pulled = pallas.product(total.astype(out.dtype), out[...], over=1)
+    low = total.astype(out.dtype)
+    of_x[...], low_of_x[...], pulled = total, low, pallas.product(low, out[...], over=1)
     of_found[...] = (scale[0] * pulled).astype(of_found.dtype)
-    sums[pl.ds(inner, width)], sums[pl.ds(inner + width, width)] = jnp.sum(cotangent[...], axis=0), jnp.sum(total, axis=0)
+    sums[pl.ds(inner, width)], sums[pl.ds(inner + width, width)] = _sum_rows(pull), _sum_rows(low)
     sums[inner + 2 * width] = jnp.sum(along + jnp.sum(found[...].astype(jnp.float32) * pulled, axis=1))
 
 
@@ -161,10 +151,20 @@ def _gate(x: Array) -> Array:
     return 1.0 / (1.0 + jnp.exp(-STEEP * (x + CUBIC * x * x * x)))
 
 
-def _divide(rows: int, *arrays: Array) -> list[Array]:
+def _sum_rows(x: Float[Array, "rows width"]) -> Float[Array, " width"]:
+    """Sums rows on the matrix units: threads would have to exchange them."""
+    return jnp.sum(pallas.product(jnp.full((LEAST, len(x)), 1.0 / LEAST, x.dtype), x), axis=0)
+
+
+def _divide(*arrays: Array) -> list[Array]:
     """Divides rows into tiles [tiles, rows, width]."""
-    rows = math.gcd(math.prod(arrays[0].shape[:-1]), rows)
+    rows = math.gcd(math.prod(arrays[0].shape[:-1]), ROWS)
     return [x.reshape(-1, rows, x.shape[-1]) for x in arrays]
+
+
+def _settings(dtype: str) -> plgpu.CompilerParams:
+    """Of a program, see Triton; with float32 numbers more stages were slower."""
+    return plgpu.CompilerParams(num_warps=4, num_stages=3 if dtype == "bfloat16" else 1)
 
 
 def _prepare(dtype: str, scale: Array, weights: Weights) -> list[Any]:
