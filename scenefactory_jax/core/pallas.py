@@ -1,4 +1,4 @@
-"""Shared parts of the Triton kernels: the choice of the platform, blocks of operands, and the length of masks."""
+"""Shared parts of the Triton kernels: the choice of the platform, blocks of operands, products, and the length of masks."""
 
 from collections.abc import Callable
 from typing import Any
@@ -23,6 +23,11 @@ def row(operand: Any) -> pl.BlockSpec:
 def whole(operand: Any) -> pl.BlockSpec:
     """All of an operand for every program of any grid."""
     return pl.BlockSpec(operand.shape, lambda *programs: (0,) * len(operand.shape))
+
+
+def product(a: Array, b: Array, *, along: int = 1, over: int = 0) -> Array:
+    """Multiplies matrices on the matrix units, over an axis of each; sums are float32."""
+    return jax.lax.dot_general(a, b, (((along,), (over,)), ((), ())), preferred_element_type=jnp.float32)
 
 
 def block_of(mask: Bool[Array, "*n K"]) -> Int[Array, "*n"]:

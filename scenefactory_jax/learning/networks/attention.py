@@ -5,6 +5,7 @@ embedding: bfloat16 has 0.3 m for a place at 70 m.
 """
 
 import dataclasses
+import functools
 import itertools
 from typing import Any
 
@@ -94,9 +95,9 @@ def join_tokens(tokens: dict[str, Tokens]) -> Tokens:
 
 
 class Attention(nn.Module):
-    """Multi-head attention of queries [B, T, width] to keys and values that `project` computes; returns the change of the queries.
+    """Multi-head attention of queries [B, T, width] to keys and values that `project` computes.
 
-    Queries that have no valid key get the bias of the last layer.
+    Returns what all heads found, zeros for a query without a valid key; `out` has the weights of the layer behind.
     """
 
     width: int
@@ -109,7 +110,7 @@ class Attention(nn.Module):
         self.query = dense(inner, self.dtype, use_bias=self.query_bias)
         self.key = dense(inner, self.dtype, use_bias=False)
         self.value = dense(inner, self.dtype, use_bias=False)
-        self.out = dense(self.width, self.dtype)
+        self.out = Affine(inner, self.width, lecun_uniform)
 
     def project(self, x: Float[Array, "B S D"]) -> tuple[Float[Array, "B S H E"], Float[Array, "B S H E"]]:
         """Computes keys and values of tokens."""
@@ -117,7 +118,7 @@ class Attention(nn.Module):
 
     def __call__(
         self, x: Float[Array, "B T D"], keys_values: tuple[Array, Array], mask: Bool[Array, "B #T S"] | None = None
-    ) -> Float[Array, "B T D"]:
+    ) -> Float[Array, "B T C"]:
         keys, values = keys_values
         queries = self._split(self.query(x))
         mask = jnp.ones((*keys.shape[:1], 1, keys.shape[1]), bool) if mask is None else mask
@@ -125,7 +126,7 @@ class Attention(nn.Module):
             found = attend(queries, keys, values, mask[:, 0])
         else:
             found = attend_plainly(queries, keys, values, mask)
-        return self.out(found.reshape(*x.shape[:-1], -1)).astype(jnp.float32)
+        return found.reshape(*x.shape[:-1], -1)
 
     def _split(self, x: Float[Array, "B T C"]) -> Float[Array, "B T H E"]:
         return x.reshape(*x.shape[:-1], self.numbers.heads, self.numbers.head_features)
@@ -158,24 +159,26 @@ def _attend_forward(queries: Array, keys: Array, values: Array, mask: Array) -> 
 
 def _attend_backward(residuals: tuple, cotangent: Array) -> tuple[Array, Array, Array, None]:
     def plain(queries: Array, keys: Array, values: Array, mask: Array, found: Array, total: Array, cotangent: Array) -> tuple:
-        return jax.vjp(lambda q, k, v: attend_plainly(q, k, v, mask[:, None]), queries, keys, values)[1](cotangent)
+        return jax.vjp(functools.partial(attend_plainly, mask=mask[:, None]), queries, keys, values)[1](cotangent)
 
-    return (*pallas.on_gpu(attention_kernel.gradient, plain, *residuals, cotangent), None)
+    return *pallas.on_gpu(attention_kernel.gradient, plain, *residuals, cotangent), None
 
 
 attend.defvjp(_attend_forward, _attend_backward)
 
 
 class FeedForward(nn.Module):
-    """A dense layer, GELU, and a dense layer back to the width of the input."""
+    """Weights of a feed-forward part, see `residual.add`: a dense layer, and a dense layer back."""
 
-    multiple: int  # of the input's width, which is the hidden one
-    dtype: str
+    width: int
+    multiple: int  # of the width, which is the hidden one
 
-    @nn.compact
-    def __call__(self, x: Float[Array, "B T D"]) -> Float[Array, "B T D"]:
-        hidden = dense(x.shape[-1] * self.multiple, self.dtype, name="hidden")(x)
-        return dense(x.shape[-1], self.dtype, name="out")(jax.nn.gelu(hidden)).astype(jnp.float32)
+    def setup(self) -> None:
+        self.hidden = Affine(self.width, self.width * self.multiple, lecun_uniform)
+        self.out = Affine(self.width * self.multiple, self.width, lecun_uniform)
+
+    def __call__(self) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
+        return self.hidden(), self.out()
 
 
 def select_nearest_keys(

@@ -4,9 +4,6 @@ ReZero (arXiv:2003.04887) in place of normalisation: each attention and each fee
 is 0 at first.
 """
 
-from collections.abc import Callable
-from typing import Any
-
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
@@ -16,6 +13,7 @@ from scenefactory_jax.core.schema import ConfigError
 from scenefactory_jax.core.types import Observation
 from scenefactory_jax.env.observations.flat_vector import flatten_observation
 from scenefactory_jax.env.observations.vmax import Block
+from scenefactory_jax.learning.networks import residual
 from scenefactory_jax.learning.networks.attention import (
     Attention,
     Embedding,
@@ -94,12 +92,25 @@ class LatentEncoder(BlockEncoder):
     numbers: Transformer
     dtype: str
 
-    def add(self, name: str, x: Array, parts: list[Callable[[Array], Array]]) -> Array:
-        """Adds what the parts compute, one after the other, times one learnt number (ReZero)."""
+    def add(
+        self,
+        name: str,
+        x: Float[Array, "B T D"],
+        parts: tuple[Attention, FeedForward | None],
+        keys_values: tuple[Array, Array] | None = None,
+        mask: Bool[Array, "B #T S"] | None = None,
+    ) -> Float[Array, "B T D"]:
+        """Adds what the attention and then the feed-forward part compute, times one learnt number (ReZero).
+
+        Args:
+            keys_values: that the attention is to; the queries' own by default.
+        """
+        attention, forward = parts
         scale = self.param(f"rezero_{name}", nn.initializers.zeros, ())
-        for part in parts:
-            x = x + scale * part(x)
-        return x
+        found = attention(x, attention.project(x) if keys_values is None else keys_values, mask)
+        if forward is None:
+            return x + scale * residual.affine(self.dtype, attention.out(), found).astype(jnp.float32)
+        return residual.add(self.dtype, self.numbers.kernels, x, found, scale, (attention.out(), *forward()))
 
     def start(self, count: int, width: int, batch: int, name: str = "latents") -> Float[Array, "B count width"]:
         """The learnt latents, for each sample."""
@@ -107,15 +118,15 @@ class LatentEncoder(BlockEncoder):
 
     def parts(self, name: str, width: int) -> tuple[Attention, FeedForward]:
         """An attention to latents or tokens of that width, and the feed-forward part behind it."""
-        return self.attention(width, f"{name}_attention"), self.feed_forward(f"{name}_feed_forward")
+        return self.attention(width, f"{name}_attention"), self.feed_forward(width, f"{name}_feed_forward")
 
     def attention(self, width: int, name: str, *, query_bias: bool = False) -> Attention:
         """An attention that changes what is that wide."""
         return Attention(width, self.numbers, self.dtype, query_bias, name=name)
 
-    def feed_forward(self, name: str) -> FeedForward:
-        """A feed-forward part."""
-        return FeedForward(self.numbers.feed_forward, self.dtype, name=name)
+    def feed_forward(self, width: int, name: str) -> FeedForward:
+        """A feed-forward part of what is that wide."""
+        return FeedForward(width, self.numbers.feed_forward, name=name)
 
 
 class LatentQuery(LatentEncoder):
@@ -127,12 +138,12 @@ class LatentQuery(LatentEncoder):
 
     def encode(self, blocks: Blocks) -> Float[Array, "B W"]:
         tokens, mask = join_tokens(Tokenizer(self.numbers.embedding, self.dtype, name="tokens")(blocks))
-        (cross, cross_forward), (own, own_forward) = self.parts("cross", self.width), self.parts("self", self.width)
-        read = _attend(cross, cross.project(tokens), mask[:, None])  # once for all rounds
+        cross, own = self.parts("cross", self.width), self.parts("self", self.width)
+        keys_values = cross[0].project(tokens)  # once for all rounds
         x = self.start(self.latents, self.width, len(mask))
         for index in range(self.rounds):
-            x = self.add(f"cross_{index}", x, [read, cross_forward])
-            x = self.add(f"self_{index}", x, [_attend(own), own_forward])
+            x = self.add(f"cross_{index}", x, cross, keys_values, mask[:, None])
+            x = self.add(f"self_{index}", x, own)
         return jnp.mean(x, axis=1)
 
 
@@ -145,8 +156,8 @@ class HierarchicalLatentQuery(LatentEncoder):
     def encode(self, blocks: Blocks) -> Float[Array, "B W"]:
         x = self.start(self.latents, self.width, len(next(iter(blocks.values())).mask))
         for name, (tokens, mask) in Tokenizer(self.numbers.embedding, self.dtype, name="tokens")(blocks).items():
-            attention, forward = self.parts(name, self.width)
-            x = self.add(name, x, [_attend(attention, attention.project(tokens), mask[:, None]), forward])
+            parts = self.parts(name, self.width)
+            x = self.add(name, x, parts, parts[0].project(tokens), mask[:, None])
         return jnp.mean(x, axis=1)
 
 
@@ -168,9 +179,8 @@ class MotionTransformer(LatentEncoder):
         for index in range(self.layers):
             attention = self.attention(x.shape[-1], f"attention_{index}", query_bias=True)
             near = select_nearest_keys(x, keys, valid, self.nearest)
-            parts: list[Any] = [_attend(attention, attention.project(keys), near)]
-            parts += [self.feed_forward(f"feed_forward_{index}")] if index else []
-            x = self.add(str(index), x, parts)
+            forward = self.feed_forward(x.shape[-1], f"feed_forward_{index}") if index else None
+            x = self.add(str(index), x, (attention, forward), attention.project(keys), near)
         return jnp.sum(jnp.where(mask[..., None], x, 0.0), axis=1) / jnp.maximum(jnp.sum(mask, axis=1, keepdims=True), 1)
 
 
@@ -185,17 +195,9 @@ class Wayformer(LatentEncoder):
         features = []
         for name, (tokens, mask) in Tokenizer(self.numbers.embedding, self.dtype, time_scalars=True, name="tokens")(blocks).items():
             x = self.start(self.latents, self.width, len(mask), f"{name}_latents")
-            attention, forward = self.parts(f"{name}_0", self.width)
-            x = self.add(f"{name}_0", x, [_attend(attention, attention.project(tokens), mask[:, None]), forward])
+            parts = self.parts(f"{name}_0", self.width)
+            x = self.add(f"{name}_0", x, parts, parts[0].project(tokens), mask[:, None])
             for index in range(1, self.depth):
-                attention, forward = self.parts(f"{name}_{index}", self.width)
-                x = self.add(f"{name}_{index}", x, [_attend(attention), forward])
+                x = self.add(f"{name}_{index}", x, self.parts(f"{name}_{index}", self.width))
             features.append(x)
         return jnp.mean(jnp.concatenate(features, axis=1), axis=1)
-
-
-def _attend(
-    attention: Attention, keys_values: tuple[Array, Array] | None = None, mask: Bool[Array, "B #T S"] | None = None
-) -> Callable[[Array], Array]:
-    """The attention as a function of the queries; to themselves without keys."""
-    return lambda x: attention(x, attention.project(x) if keys_values is None else keys_values, mask)

@@ -178,7 +178,7 @@ class Layers(nn.Module):
 
 
 class Affine(nn.Module):
-    """Kernel and bias of one dense layer, initialised as `flax.linen.Dense` does."""
+    """Kernel and bias of one dense layer, initialised as `flax.linen.Dense` does by default."""
 
     inputs: int
     outputs: int

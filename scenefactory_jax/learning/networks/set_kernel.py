@@ -83,10 +83,10 @@ def _encode(last, x, mask, first, second, second_bias, pooled, winner, *, activa
         at = index * rows + lanes
         valid = plgpu.load(mask.at[at], mask=at < width, other=0) != 0
         table = plgpu.load(x.at[at[:, None], columns[None, :]], mask=valid[:, None] & (columns < features)[None, :], other=ones)
-        inner = [activate(_product(table, first[:, pl.ds(start, length)])).astype(second.dtype) for start, length in hidden]
+        inner = [activate(pallas.product(table, first[:, pl.ds(start, length)])).astype(second.dtype) for start, length in hidden]
         results = []
         for (start, length), (value, where) in zip(out, best, strict=True):
-            parts = [_product(part, second[pl.ds(k, w), pl.ds(start, length)]) for part, (k, w) in zip(inner, hidden, strict=True)]
+            parts = [pallas.product(part, second[pl.ds(k, w), pl.ds(start, length)]) for part, (k, w) in zip(inner, hidden, strict=True)]
             values = jnp.where(valid[:, None], functools.reduce(jnp.add, parts), -jnp.inf).reshape(*split, length)
             largest, half = jnp.max(values, axis=1), jnp.argmax(values, axis=1).astype(jnp.int32)
             better = largest > value
@@ -165,11 +165,11 @@ def _gradient(last, x, winner, cotangent, first, second, outer, inner, *, activa
         table = plgpu.load(x.at[at, row[:, None], columns[None, :]], mask=known, other=ones)
         results = []
         for (start, length), (wide, narrow) in zip(parts, sums, strict=True):
-            before = _product(table, first[:, pl.ds(start, length)])
+            before = pallas.product(table, first[:, pl.ds(start, length)])
             after = activate(before)
             steep = pull[:, None] * second[pl.ds(base, CHANNELS), pl.ds(start, length)] * slope(before, after)
             wide += pull[:, None] * after.astype(dtype).astype(jnp.float32)
-            results.append((wide, narrow + _product(table, steep, along=0)))
+            results.append((wide, narrow + pallas.product(table, steep, along=0)))
         return results
 
     begin = [(jnp.zeros((CHANNELS, length), jnp.float32), jnp.zeros((INPUTS, length), jnp.float32)) for _, length in parts]
@@ -192,11 +192,6 @@ def tiles(width: int, most: int) -> list[tuple[int, int]]:
 def _ones(rows: int, features: int) -> Array:
     """Columns of a row beside its features: a one, for the bias."""
     return jnp.broadcast_to(jnp.where(jnp.arange(INPUTS) == features, 1.0, 0.0)[None, :], (rows, INPUTS))
-
-
-def _product(a: Array, b: Array, *, along: int = 1) -> Array:
-    """Multiplies matrices on the matrix units, over an axis of the first and the rows of the second; sums are float32."""
-    return jax.lax.dot_general(a, b, (((along,), (0,)), ((), ())), preferred_element_type=jnp.float32)
 
 
 def _with_bias(kernel: Array, bias: Array) -> Array:
