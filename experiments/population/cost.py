@@ -6,6 +6,7 @@ Policies of one structure are untrained ones of different seeds. Writes `result-
 """
 
 import argparse
+import shlex
 import statistics
 import tempfile
 import time
@@ -98,6 +99,7 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as folder:
         found = measure(Path(folder), worlds=given.worlds, repeats=given.repeats, only=given.only)
     command = f"python -m experiments.population.cost --worlds {given.worlds} --repeats {given.repeats}"
+    command += f" --only {shlex.join(given.only)}" if given.only else ""
     result = {**found, "command": command, "versions": run_config.versions()}
     given.out.mkdir(parents=True, exist_ok=True)
     result_file.write(given.out / "result-cost.json", result, digits=4)

@@ -9,7 +9,6 @@ from support.probes import SMALL, make_learner, make_trainer, probe, scenes
 from support.running import smoke
 
 from scenefactory_jax.cli.hydra_config import load_config
-from scenefactory_jax.cli.train import train
 from scenefactory_jax.core import config as run_config
 from scenefactory_jax.core import trusted_targets
 from scenefactory_jax.core.pytree import replace
@@ -17,7 +16,7 @@ from scenefactory_jax.core.schema import ConfigError
 from scenefactory_jax.core.types import PastPolicies
 from scenefactory_jax.env import traffic
 from scenefactory_jax.evaluation import circumstances
-from scenefactory_jax.learning import checkpoint, past_policies, policy_io, replay_buffer
+from scenefactory_jax.learning import checkpoint, past_policies, policy_io, replay_buffer, training_loop
 from scenefactory_jax.learning.networks import late_fusion
 
 pytestmark = pytest.mark.usefixtures("quickly")
@@ -190,11 +189,13 @@ def test_a_run_among_its_past_policies_resumes_bit_for_bit(tmp_path):
     """From the command's config to the folder, in two parts and in one."""
     words = ("traffic=pool", "traffic.members=[past,idm]", "traffic.past.slots=2", "traffic.past.every=1", "evaluation.enable=false")
     words += ("scenes.pack.traffic=4", "checkpoint_every=1")
-    whole = train(smoke(tmp_path / "whole", *words, "iterations=3"))
+    prepared = training_loop.prepare(smoke(tmp_path / "whole", *words))
+    train = lambda place, *more: training_loop.train(smoke(tmp_path / place, *words, *more), prepared=prepared)  # noqa: E731
+    whole = train("whole", "iterations=3")
     assert np.asarray(whole.state.past.iteration).tolist() == [2, 3]
     assert [row["past/policies"] for row in whole.metrics] == [2.0, 2.0, 2.0]
-    train(smoke(tmp_path / "parts", *words, "iterations=2"))
-    parts = train(smoke(tmp_path / "parts", *words, "iterations=3", "resume=true"))
+    train("parts", "iterations=2")
+    parts = train("parts", "iterations=3", "resume=true")
     for name in ("parameters", "past", "worlds"):
         one, other = (checkpoint_arrays(run.folder, name) for run in (whole, parts))
         assert one.keys() == other.keys() and one
