@@ -77,7 +77,7 @@ def add_past_policies(make: Callable[[Env], Trainer], env: Env, policy: Policy, 
         restart=jax.jit(restart, donate_argnums=0),
         replace_scenes=jax.jit(replace_scenes, donate_argnums=(0, 1)),
         put_samples=jax.jit(put_samples, donate_argnums=0),
-        recorded=make(past.bind({}, jnp.ones(past.slots))).recorded,
+        recorded=make(env).recorded,
     )
 
 
