@@ -142,10 +142,10 @@ def probe_with_past(every):
 
 
 def make_probe_trainer(learner, env, seen):
-    """A learner of the probe with its past policies; `seen` gets an environment whenever a program is traced."""
+    """A learner of the probe with its past policies; `seen` gets one with these whenever a program is traced."""
 
     def make(bound):
-        seen.append(bound)
+        seen.extend([bound] if bound.past is None else [])
         return make_trainer(bound, episode_steps=3) if learner == "ppo" else make_learner(learner, bound, episode_steps=3)[1]
 
     policy = late_fusion.make(**SMALL, **({} if learner == "ppo" else {"actor": "tanh_gaussian", "numbers": 2}))

@@ -17,7 +17,7 @@ from jaxtyping import Array, Bool, Float
 from scenefactory_jax.core import pallas
 from scenefactory_jax.core.schema import ConfigError, Count
 from scenefactory_jax.learning.networks import attention_kernel
-from scenefactory_jax.learning.networks.embedding_kernel import embed
+from scenefactory_jax.learning.networks.embedding_kernel import embed, embed_plain
 from scenefactory_jax.learning.networks.heads import lecun_uniform
 from scenefactory_jax.learning.networks.late_fusion import Affine, pool
 from scenefactory_jax.learning.networks.observation_blocks import Blocks
@@ -52,11 +52,13 @@ class Embedding(nn.Module):
 
     widths: tuple[int, ...]
     dtype: str
+    kernels: bool = True
 
     @nn.compact
     def __call__(self, x: Float[Array, "*batch F"]) -> Float[Array, "*batch D"]:
         pairs = itertools.pairwise((x.shape[-1], *self.widths))
-        return embed(self.dtype, [Affine(*pair, lecun_uniform, name=f"layer_{index}")() for index, pair in enumerate(pairs)], x)
+        weights = [Affine(*pair, lecun_uniform, name=f"layer_{index}")() for index, pair in enumerate(pairs)]
+        return embed(self.dtype, weights, x) if self.kernels else embed_plain(self.dtype, weights, x)
 
 
 class Tokenizer(nn.Module):
@@ -67,6 +69,7 @@ class Tokenizer(nn.Module):
 
     widths: tuple[int, ...]  # of the embeddings
     dtype: str
+    kernels: bool
     pool_steps: bool = False
     time_scalars: bool = False
 
@@ -75,7 +78,7 @@ class Tokenizer(nn.Module):
         scalars: dict[tuple[str, int], Array] = {}
         tokens = {}
         for name, (features, mask) in blocks.items():
-            x = Embedding(self.widths, self.dtype, name=f"{name}_embedding")(features).astype(jnp.float32)
+            x = Embedding(self.widths, self.dtype, self.kernels, name=f"{name}_embedding")(features).astype(jnp.float32)
             if self.pool_steps:
                 x, mask = pool(x, mask)[..., None, :], jnp.any(mask, axis=-1, keepdims=True)
             x = x + self.param(f"{name}_positions", normal, x.shape[-3:])

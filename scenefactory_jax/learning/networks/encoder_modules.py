@@ -19,6 +19,7 @@ from scenefactory_jax.learning.networks.attention import (
     Embedding,
     FeedForward,
     Tokenizer,
+    Tokens,
     Transformer,
     dense,
     join_tokens,
@@ -112,6 +113,11 @@ class LatentEncoder(BlockEncoder):
             return x + scale * residual.affine(self.dtype, attention.out(), found).astype(jnp.float32)
         return residual.add(self.dtype, self.numbers.kernels, x, found, scale, (attention.out(), *forward()))
 
+    def tokenize(self, blocks: Blocks, *, pool_steps: bool = False, time_scalars: bool = False) -> dict[str, Tokens]:
+        """Embeds the rows of all blocks, see `Tokenizer`."""
+        numbers = self.numbers
+        return Tokenizer(numbers.embedding, self.dtype, numbers.kernels, pool_steps, time_scalars, name="tokens")(blocks)
+
     def start(self, count: int, width: int, batch: int, name: str = "latents") -> Float[Array, "B count width"]:
         """The learnt latents, for each sample."""
         return jnp.broadcast_to(self.param(name, normal, (count, width)), (batch, count, width))
@@ -137,7 +143,7 @@ class LatentQuery(LatentEncoder):
     rounds: int
 
     def encode(self, blocks: Blocks) -> Float[Array, "B W"]:
-        tokens, mask = join_tokens(Tokenizer(self.numbers.embedding, self.dtype, name="tokens")(blocks))
+        tokens, mask = join_tokens(self.tokenize(blocks))
         cross, own = self.parts("cross", self.width), self.parts("self", self.width)
         keys_values = cross[0].project(tokens)  # once for all rounds
         x = self.start(self.latents, self.width, len(mask))
@@ -155,7 +161,7 @@ class HierarchicalLatentQuery(LatentEncoder):
 
     def encode(self, blocks: Blocks) -> Float[Array, "B W"]:
         x = self.start(self.latents, self.width, len(next(iter(blocks.values())).mask))
-        for name, (tokens, mask) in Tokenizer(self.numbers.embedding, self.dtype, name="tokens")(blocks).items():
+        for name, (tokens, mask) in self.tokenize(blocks).items():
             parts = self.parts(name, self.width)
             x = self.add(name, x, parts, parts[0].project(tokens), mask[:, None])
         return jnp.mean(x, axis=1)
@@ -172,7 +178,7 @@ class MotionTransformer(LatentEncoder):
         if not (chosen := [name for name in blocks if name in self.keys]):
             valid = ", ".join(blocks)
             raise ConfigError(f"policy.encoder.keys: the encoder mtr needs one of {', '.join(self.keys)}; the observation has {valid}")
-        tokens = Tokenizer(self.numbers.embedding, self.dtype, pool_steps=True, name="tokens")(blocks)
+        tokens = self.tokenize(blocks, pool_steps=True)
         joined, mask = join_tokens(tokens)
         x = joined.astype(jnp.float32)
         keys, valid = join_tokens({name: tokens[name] for name in chosen})
@@ -193,7 +199,7 @@ class Wayformer(LatentEncoder):
 
     def encode(self, blocks: Blocks) -> Float[Array, "B W"]:
         features = []
-        for name, (tokens, mask) in Tokenizer(self.numbers.embedding, self.dtype, time_scalars=True, name="tokens")(blocks).items():
+        for name, (tokens, mask) in self.tokenize(blocks, time_scalars=True).items():
             x = self.start(self.latents, self.width, len(mask), f"{name}_latents")
             parts = self.parts(f"{name}_0", self.width)
             x = self.add(f"{name}_0", x, parts, parts[0].project(tokens), mask[:, None])
