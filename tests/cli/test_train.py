@@ -541,7 +541,7 @@ def test_a_wrong_value_ends_as_one_line():
         (["train", "loggers=[tensorbord]"], "error: loggers: unknown option 'tensorbord'; valid: mlflow, tensorboard, wandb"),
         (["train", "-m", "ppo.horizn=3,4", "seed=interval(0,1)"], "error: ppo.horizn: unknown key 'horizn'; ppo has: "),
         (["evaluate", "-m", "run=runs/mine", "seed=1,2"], "error: out: expected a folder for each job of this sweep"),
-        (["drive-away"], "error: command: expected one of train, evaluate"),
+        (["drive-away"], "error: command: expected one of train, record, evaluate"),
     ],
 )
 def test_what_a_user_can_mend_is_one_line(arguments, message, monkeypatch, capsys, tmp_path):
@@ -639,7 +639,7 @@ RUNS = (
 
 
 SUITES = ("recorded_routes", "route100", "conflict", "conflict_reactive", "grip", "grip_hidden", "grip_stops")  # with routes
-SUITES += ("vmax", "vmax_noise", "nuplan", "nuplan_reactive", "wosac")
+SUITES += ("vmax", "vmax_noise", "nuplan", "nuplan_reactive", "wosac", "scenarionet")
 
 
 @pytest.mark.parametrize("name", names("protocol"))
