@@ -10,6 +10,7 @@ from support.traffic_scenes import track, with_tracks
 
 import scenefactory_jax as sf
 from scenefactory_jax.cli.hydra_config import load_config
+from scenefactory_jax.cli.hydra_config import load_config
 from scenefactory_jax.cli.train import train
 from scenefactory_jax.core.schema import ConfigError
 from scenefactory_jax.data.loading import scene_source
@@ -100,6 +101,12 @@ def test_one_word_makes_copo(tmp_path):
     assert {"copo/lcf_mean", "copo/lcf_std", "ppo/explained_variance", "copo/explained_variance_global"} <= metrics.keys()
     mean, _, value = jax.eval_shape(parts.policy.apply, state.parameters, state.worlds.observation)
     assert mean.shape == value.shape == (4, 4, 3)
+
+
+@pytest.mark.parametrize("words", [("learner=bc",), ("learner=td3",), ("learner=ppo", "ppo=steady"), ("learner=copo",)], ids="+".join)
+def test_an_experiment_takes_any_learner(words):
+    """Its numbers of SAC are an option of the group, which another learner replaces."""
+    training_loop.prepare(load_config("train", "experiment=vmax", *words))
 
 
 @pytest.mark.parametrize(
