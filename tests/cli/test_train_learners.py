@@ -10,7 +10,6 @@ from support.traffic_scenes import track, with_tracks
 
 import scenefactory_jax as sf
 from scenefactory_jax.cli.hydra_config import load_config
-from scenefactory_jax.cli.hydra_config import load_config
 from scenefactory_jax.cli.train import train
 from scenefactory_jax.core.schema import ConfigError
 from scenefactory_jax.data.loading import scene_source
