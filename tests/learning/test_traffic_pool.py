@@ -8,12 +8,15 @@ from support.policy_traffic import ABSENT, CONTEXT, STEPS, make, make_policy, sa
 from support.probes import SMALL, make_learner, make_trainer, probe, scenes
 from support.running import smoke
 
+from scenefactory_jax.cli import evaluate
 from scenefactory_jax.cli.hydra_config import load_config
 from scenefactory_jax.core import config as run_config
 from scenefactory_jax.core import trusted_targets
 from scenefactory_jax.core.pytree import replace
+from scenefactory_jax.core.raw_scene import SceneError
 from scenefactory_jax.core.schema import ConfigError
 from scenefactory_jax.core.types import PastPolicies
+from scenefactory_jax.data.loading import scene_source
 from scenefactory_jax.env import traffic
 from scenefactory_jax.evaluation import circumstances
 from scenefactory_jax.learning import checkpoint, past_policies, policy_io, replay_buffer, training_loop
@@ -119,8 +122,21 @@ def test_without_a_training_past_policies_are_left_out(runs):
     assert state.driver.shape == ()
     config = smoke("unused", "traffic=pool", f"traffic.members=[past,{runs[0]},idm]")
     assert not trusted_targets.find_outside_targets({"traffic": config["traffic"]})
-    told = circumstances.describe(config)["Background traffic"]
-    assert told == f"one of `past`, `{runs[0].name}`, `idm` in each episode; past policies in training only"
+    told = lambda *members: circumstances.describe({"traffic": config["traffic"] | {"members": [*members]}})["Background traffic"]  # noqa: E731
+    absent = "without the past policies that drive in training"
+    assert told("past", str(runs[0]), "idm") == f"one of `{runs[0].name}`, `idm` in each episode, {absent}"
+    assert told("past") == f"`log`, {absent}" and told("idm", "log") == "one of `idm`, `log` in each episode"
+
+
+def test_an_evaluation_says_that_past_policies_are_missing(tmp_path, monkeypatch, capsys):
+    def stop(*_, **__):
+        raise SceneError("none")
+
+    monkeypatch.setattr(scene_source, "load_heldout_scenes", stop)
+    for members, said in (("past,idm", "background traffic: `idm`, without the past policies that drive in training\n"), ("idm", "")):
+        with pytest.raises(SceneError):
+            evaluate.evaluate_run(smoke(tmp_path, "traffic=pool", f"traffic.members=[{members}]"), tmp_path)
+        assert capsys.readouterr().out == said
 
 
 def probe_with_past(every):
