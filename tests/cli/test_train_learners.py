@@ -121,3 +121,8 @@ def test_mistakes_are_named(tmp_path, change, message):
     config["learner"] |= change
     with pytest.raises(ConfigError, match=message):
         training_loop.make_trainer(config, environment.make_env(config | {"observations": {}}), training_loop.make_policy(config))
+
+
+def test_what_learners_share_is_no_learner(tmp_path):
+    with pytest.raises(ConfigError, match=r"learner\._target_: expected the name of a function, got ''"):
+        training_loop.prepare(smoke(tmp_path / "run", "learner=base"))

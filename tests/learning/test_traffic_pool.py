@@ -238,6 +238,7 @@ def checkpoint_arrays(folder, name):
         (["past"], {"past": {"slots": 0, "every": 1}}, r"^traffic\.past\.slots: expected an integer >= 1, got 0"),
         (["past"], {"kinds": {}}, r"^traffic\.kinds\.log: missing; it takes the place of past policies"),
         (["idm"], {"kinds": {"past": {}}}, r"^traffic\.kinds\.past: expected another name"),
+        (["idm"], {"vehicles": {"run": "town"}}, r"^traffic\.vehicles\.run: expected null, got 'town'; traffic\.members has"),
     ],
 )
 def test_mistakes_are_named(members, changes, message):
