@@ -5,17 +5,15 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from support.policy_traffic import ABSENT, CONTEXT, STEPS, make, make_policy, save, simulate, street
-from support.probes import SMALL, make_learner, make_trainer, probe, scenes
+from support.probes import SMALL, make_learner, make_trainer, probe_with_past, scenes
 from support.running import smoke
 
 from scenefactory_jax.cli import evaluate
 from scenefactory_jax.cli.hydra_config import load_config
 from scenefactory_jax.core import config as run_config
 from scenefactory_jax.core import trusted_targets
-from scenefactory_jax.core.pytree import replace
 from scenefactory_jax.core.raw_scene import SceneError
 from scenefactory_jax.core.schema import ConfigError
-from scenefactory_jax.core.types import PastPolicies
 from scenefactory_jax.data.loading import scene_source
 from scenefactory_jax.env import traffic
 from scenefactory_jax.evaluation import circumstances
@@ -139,24 +137,6 @@ def test_an_evaluation_says_that_past_policies_are_missing(tmp_path, monkeypatch
         assert capsys.readouterr().out == said
 
 
-def probe_with_past(every):
-    """A probe that pays the number of past policies and the sum of their first bias, beside what it pays anyway."""
-    env = probe(life=2, episode_steps=3)
-
-    def bind(parameters, there):
-        bias = jax.tree.leaves(parameters)[0]
-        value = jnp.sum(jnp.where(there, bias.reshape(len(bias), -1).sum(1), 0.0))
-
-        def control_step(scene, state, action):
-            after, result = env.control_step(scene, state, action)
-            terms = {name: jnp.full(len(state.active), number) for name, number in (("past", value), ("there", there.sum() * 1.0))}
-            return after, replace(result, terms=result.terms | terms)
-
-        return env._replace(control_step=control_step)
-
-    return env._replace(past=PastPolicies(2, every, bind))
-
-
 def make_probe_trainer(learner, env, seen):
     """A learner of the probe with its past policies; `seen` gets one with these whenever a program is traced."""
 
@@ -171,7 +151,7 @@ def make_probe_trainer(learner, env, seen):
 @pytest.mark.parametrize("learner", ["ppo", pytest.param("sac", marks=pytest.mark.slow)])
 def test_a_training_keeps_the_latest_policies_and_resumes_bit_for_bit(tmp_path, learner):
     seen, every, taken = [], 2, []
-    trainer, stage = make_probe_trainer(learner, probe_with_past(every), seen), scenes(4)
+    trainer, stage = make_probe_trainer(learner, probe_with_past(every, life=2, episode_steps=3), seen), scenes(4)
     state = trainer.init(jax.random.key(0), stage)
     first = jax.device_get(state.parameters)
     jax.tree.map(lambda kept, own: np.testing.assert_array_equal(kept[0], own), state.past.parameters, first)
