@@ -15,10 +15,11 @@ from scenefactory_jax.core import trusted_targets
 from scenefactory_jax.core.config import flatten
 from scenefactory_jax.core.schema import read as read_settings
 from scenefactory_jax.data.loading import scene_source
-from scenefactory_jax.evaluation import protocols
+from scenefactory_jax.evaluation import circumstances, protocols
 from scenefactory_jax.evaluation.protocols import Evaluator
 from scenefactory_jax.evaluation.settings import ScoreSettings
 from scenefactory_jax.learning import checkpoint, policy_io
+from scenefactory_jax.learning.traffic_pool import PAST
 from scenefactory_jax.visualization.report import evaluation_files, planner_table, tables
 from scenefactory_jax.visualization.report.evaluation_files import Result
 
@@ -74,6 +75,8 @@ def _evaluate(
 ) -> Result:
     scores = settings.get("protocol", {}).get("scores")
     scores = scores and read_settings(scores, ScoreSettings, where="protocol.scores")
+    if PAST in config["traffic"].get("members", []):
+        print(f"background traffic: {circumstances.describe(config)['Background traffic']}", flush=True)
     keep_raw = bool(scores and scores.wosac)
     scenes = scene_source.load_heldout_scenes(config["scenes"], path=request["scenes"], keep_raw=keep_raw)
     print(scenes.account, flush=True)

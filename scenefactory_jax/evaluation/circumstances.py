@@ -1,8 +1,10 @@
 """What decides the episodes of an evaluation, in words, from its config: starts, weather, background traffic, dynamics, scenes."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
+
+from scenefactory_jax.learning.traffic_pool import LOG, PAST
 
 STARTS = {
     "logged": "as recorded, at the recorded speed",
@@ -19,7 +21,7 @@ TRAFFIC = {
     "idm_traffic": "vehicles with a route drive and react (IDM), people and cyclists as recorded",
     "trajectory_idm_traffic": "as recorded, some vehicles react along their tracks (MetaDrive's IDM)",
     "scenefactory_jax.learning.policy_traffic.policy_traffic": "vehicles that move drive by the policy {run}, all others as recorded",
-    "scenefactory_jax.learning.traffic_pool.pool_traffic": "one of {members} in each episode; past policies in training only",
+    "scenefactory_jax.learning.traffic_pool.pool_traffic": "{members}",
     "mixed": "one kind of several in each episode",
 }
 
@@ -38,7 +40,7 @@ def describe(config: Mapping[str, Any]) -> dict[str, str]:
     if "traffic" in config:
         name = config["traffic"]["_target_"]
         run = Path(str(config["traffic"].get("run"))).name
-        members = ", ".join(f"`{Path(member).name}`" for member in config["traffic"].get("members", []))
+        members = _members(config["traffic"].get("members", []))
         labels["Background traffic"] = TRAFFIC[name].format(run=f"`{run}`", members=members) if name in TRAFFIC else f"`{name}`"
     if "dynamics" in config:
         labels["Dynamics"] = _dynamics(config["dynamics"])
@@ -51,6 +53,13 @@ def describe(config: Mapping[str, Any]) -> dict[str, str]:
                 f"up to {pack['agents']} agents in {pack['scene_size_m']:g} m x {pack['scene_size_m']:g} m, centre {pack['centre']}"
             )
     return labels
+
+
+def _members(members: Sequence[str]) -> str:
+    """What drives in a pool, outside of the training whose past policies are a member."""
+    there = [f"`{Path(member).name}`" for member in members if member != PAST] or [f"`{LOG}`"]
+    drawn = there[0] if len(there) == 1 else f"one of {', '.join(there)} in each episode"
+    return f"{drawn}, without the past policies that drive in training" if PAST in members else drawn
 
 
 def _starts(sampler: Mapping[str, Any]) -> str:

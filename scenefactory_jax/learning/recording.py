@@ -1,7 +1,7 @@
 """Records samples of an expert: it drives every scene once, and what it saw and did is written to a folder of chunks (`sample_files`).
 
 Scenes come in batches, one a world, loaded while those before are driven. An episode is driven in pieces of `steps` actions, each one call
-of one compiled program, until no agent has anything to teach any more.
+of one compiled program, until the logs have ended and no agent has anything to teach any more.
 """
 
 import dataclasses
@@ -108,26 +108,32 @@ def drive(
 
 
 def drive_scenes(config: Mapping[str, Any], env: Env, run: Callable[..., Any], steps: int, actions: int) -> Iterator[Arrays]:
-    """Drives every scene once and yields the arrays of each piece's samples, in the order of time."""
+    """Drives every scene once, whatever the stream's sampler, and yields the arrays of each piece's samples, in the order of time."""
     source = scene_source.open_source(config["scenes"])
     total, count = config["scenes"]["count"] if source.count is None else source.count, config["worlds"]
     start, run, key = jax.jit(functools.partial(trainer.start_worlds, env)), jax.jit(run), jax.random.key(config["seed"])
-    with stream.open_stream({**config, "stream": {**config["stream"], "swap_fraction": 1.0}}, mesh=None, before=None) as flow:
-        scenes = flow.scenes()
+    in_turn = {"swap_fraction": 1.0, "sampler": {"_target_": "shuffled"}, "curriculum": None}
+    respawns, dt = config["spawning"]["respawn_clearance_m"] is not None, env.action_repeat / config["timing"]["control_hz"]
+    with stream.open_stream({**config, "stream": {**config["stream"], **in_turn}}, mesh=None, before=None) as flow:
+        scenes, driven = flow.scenes(), np.zeros(0, int)
         for batch in range(-(-total // count)):
             if batch:
                 _, scenes = flow.exchange(lambda state, old, rows, new: (state, new), None, scenes)
                 flow.draw()
             start_key, drive_key = jax.random.split(jax.random.fold_in(key, batch))
             placed, worlds = np.array(flow.state()["placed"]), start(start_key, scenes)
-            left = total - batch * count  # the last batch repeats scenes to be full
+            # a batch repeats scenes in place of those that cannot be used, the last one also to be full
+            once = np.isin(np.arange(count), np.unique(placed, return_index=True)[1]) & ~np.isin(placed, driven) & (placed < total)
+            driven, logged = np.append(driven, placed), np.ceil(scenes.log.valid.shape[-1] * float(jnp.max(scenes.log.dt)) / dt)
             for time in range(0, actions, steps):
                 now, piece_key = jnp.int32(time * env.action_repeat), jax.random.fold_in(drive_key, time)
                 worlds, result = run(scenes, worlds, now, piece_key)
                 rows, valid = jax.device_get(result)
-                chosen = np.nonzero(valid & (np.arange(count) < left)[:, None])
+                chosen = np.nonzero(valid & once[:, None])
                 if not len(chosen[0]):
-                    break
+                    if time >= logged and not respawns:
+                        break
+                    continue
                 origin = (placed[chosen[1]], chosen[2], chosen[0] + time)
                 named = {name: leaf[chosen] for name, leaf in sample_files.name_rows(rows).items()}
                 yield named | {name: value.astype(np.int32) for name, value in zip(ORIGIN, origin, strict=True)}

@@ -65,12 +65,12 @@ def pool_traffic(
         config: of the environment; a training's has the policy.
 
     Raises:
-        ConfigError: no such member, one named twice, or another number of weights.
+        ConfigError: no such member, one named twice, another number of weights, or vehicles with a policy of their own.
     """
     context = {"friction": friction, "physics_dt": physics_dt, "control_dt": control_dt}
     kinds = {name: kind for name, kind in kinds.items() if kind is not None}
     shares = dict(zip(members, _read_weights(members, weights), strict=True))
-    _check_members(members, kinds)
+    _check_members(members, kinds, vehicles)
     make_kind = lambda name: traffic.make(kinds[name], where=f"traffic.kinds.{name}", config=config, **context)  # noqa: E731
     others = [(make_kind(name), share) for name, share in shares.items() if name in kinds]
     fixed = [_load(name, share, kinds) for name, share in shares.items() if name not in kinds and name != PAST]
@@ -114,13 +114,15 @@ def _read_weights(members: list[str], weights: list[float] | None) -> list[float
     return [1.0] * len(members) if weights is None else weights
 
 
-def _check_members(members: list[str], kinds: Mapping[str, Any]) -> None:
+def _check_members(members: list[str], kinds: Mapping[str, Any], vehicles: Mapping[str, Any]) -> None:
     if not members or len(set(members)) < len(members):
         raise ConfigError(f"traffic.members: expected one member or more, each once, got {members}")
     if PAST in kinds:
         raise ConfigError(f"traffic.kinds.{PAST}: expected another name, since this one stands for past policies")
     if members == [PAST] and LOG not in kinds:
         raise ConfigError(f"traffic.kinds.{LOG}: missing; it takes the place of past policies outside of a training")
+    if given := [name for name in ("run", "policy", "observations") if vehicles.get(name) is not None]:
+        raise ConfigError(f"traffic.vehicles.{given[0]}: expected null, got {vehicles[given[0]]!r}; traffic.members has the policies")
 
 
 def _load(name: str, share: float, kinds: Mapping[str, Any]) -> tuple[Drivers, float]:

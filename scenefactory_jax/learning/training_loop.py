@@ -158,7 +158,7 @@ def make_trainer(config: Mapping[str, Any], env: Env, policy: Policy, *, mesh: M
 
     The entry `learner` names a function (config, env, policy, mesh=) -> Trainer, and has the numbers that it reads.
     """
-    make = resolve_target(config["learner"]["_target_"], builtins=ppo, where="learner")
+    make = resolve_target(config["learner"].get("_target_", ""), builtins=ppo, where="learner")
     if env.past is None:
         return make(config, env, policy, mesh=mesh)
     return past_policies.add_past_policies(lambda bound: make(config, bound, policy, mesh=mesh), env, policy, mesh=mesh)

@@ -1,6 +1,7 @@
 """`record` from the config to a folder of samples, and `train learner.samples=...` that learns from it."""
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from support.running import smoke
@@ -9,7 +10,8 @@ from scenefactory_jax.cli.hydra_config import load_config
 from scenefactory_jax.cli.record import record
 from scenefactory_jax.cli.train import train
 from scenefactory_jax.core.schema import ConfigError
-from scenefactory_jax.learning import sample_files, training_loop
+from scenefactory_jax.env import environment
+from scenefactory_jax.learning import recording, sample_files, training_loop
 
 pytestmark = pytest.mark.usefixtures("quickly")
 CHUNK, NOISE = 50, "learner.expert_noise.part=0.5"
@@ -46,6 +48,22 @@ def test_what_is_recorded_can_be_read_by_numpy(folder):
         np.testing.assert_array_equal(steps, np.arange(len(steps)))
     assert np.abs(samples["action"]).max() <= 1.0 and samples["action"].std(0)[0] > 0.01
     assert index.about["expert_noise"]["part"] == 0.5 and index.config["timing"] == {"control_hz": 30}
+
+
+def test_every_scene_is_driven_once_to_the_end_of_its_log(tmp_path):
+    """Whatever the stream's sampler; a scene that cannot be used gives no other one twice, and a gap in the logs ends nothing."""
+    config = load(tmp_path / "out", "worlds=4", "stream=levels", "stream.curriculum.levels=2")
+    config["scenes"]["generate"] = {"_target_": "support.streets.street", "unusable": [3], "broken": [], "deadly": [], "endless": []}
+    known = jnp.arange(60) % 5 == 3
+
+    def run(scenes, worlds, now, key):
+        valid = jnp.broadcast_to(known[now // 3], (1, 4, 4))
+        return worlds, ({"action": jnp.zeros((1, 4, 4, 3))}, valid)
+
+    pieces = list(recording.drive_scenes(config, environment.make_env(config), run, 1, 20))
+    places = np.concatenate([np.stack([piece[name] for name in sample_files.ORIGIN], axis=1) for piece in pieces])
+    assert set(places[:, 0]) == {0, 1, 2} and set(places[:, 2]) == {3, 8}  # of 11 actions
+    assert len(np.unique(places, axis=0)) == len(places) == 3 * 4 * 2
 
 
 def test_a_killed_and_resumed_run_is_the_unbroken_one(folder, tmp_path):

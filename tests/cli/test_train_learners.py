@@ -102,6 +102,12 @@ def test_one_word_makes_copo(tmp_path):
     assert mean.shape == value.shape == (4, 4, 3)
 
 
+@pytest.mark.parametrize("words", [("learner=bc",), ("learner=td3",), ("learner=ppo", "ppo=steady"), ("learner=copo",)], ids="+".join)
+def test_an_experiment_takes_any_learner(words):
+    """Its numbers of SAC are an option of the group, which another learner replaces."""
+    training_loop.prepare(load_config("train", "experiment=vmax", *words))
+
+
 @pytest.mark.parametrize(
     "change, message",
     [
@@ -115,3 +121,8 @@ def test_mistakes_are_named(tmp_path, change, message):
     config["learner"] |= change
     with pytest.raises(ConfigError, match=message):
         training_loop.make_trainer(config, environment.make_env(config | {"observations": {}}), training_loop.make_policy(config))
+
+
+def test_what_learners_share_is_no_learner(tmp_path):
+    with pytest.raises(ConfigError, match=r"learner\._target_: expected the name of a function, got ''"):
+        training_loop.prepare(smoke(tmp_path / "run", "learner=base"))

@@ -53,11 +53,12 @@ def test_two_devices_learn_what_one_learns(found):
 
 
 def test_every_device_has_the_past_policies(found):
-    """And learning is what it is without them, where nothing drives by them."""
+    """Programs read them on each, and learning is what it is without them, where nothing drives by them."""
     plain, past = found[2, 4], found[2, 4, 1]
-    metrics = [{name: value for name, value in row.items() if name != "past/policies"} for row in past["metrics"]]
-    agree(past | {"metrics": metrics}, plain)
+    added = {"past/policies", "reward/past", "reward/there"}
+    agree(past | {"metrics": [{name: value for name, value in row.items() if name not in added} for row in past["metrics"]]}, plain)
     assert [row["past/policies"] for row in past["metrics"]] == [2.0, 2.0, 2.0] and past["taken"] == [[2, 3]] * 2
+    assert [row["reward/there"] for row in past["metrics"]] == [1.0, 2.0, 2.0] and past["metrics"][2]["reward/past"] != 0.0
     np.testing.assert_array_equal(past["newest"], past["parameters"])
 
 

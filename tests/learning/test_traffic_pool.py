@@ -5,15 +5,16 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from support.policy_traffic import ABSENT, CONTEXT, STEPS, make, make_policy, save, simulate, street
-from support.probes import SMALL, make_learner, make_trainer, probe, scenes
+from support.probes import SMALL, make_learner, make_trainer, probe_with_past, scenes
 from support.running import smoke
 
+from scenefactory_jax.cli import evaluate
 from scenefactory_jax.cli.hydra_config import load_config
 from scenefactory_jax.core import config as run_config
 from scenefactory_jax.core import trusted_targets
-from scenefactory_jax.core.pytree import replace
+from scenefactory_jax.core.raw_scene import SceneError
 from scenefactory_jax.core.schema import ConfigError
-from scenefactory_jax.core.types import PastPolicies
+from scenefactory_jax.data.loading import scene_source
 from scenefactory_jax.env import traffic
 from scenefactory_jax.evaluation import circumstances
 from scenefactory_jax.learning import checkpoint, past_policies, policy_io, replay_buffer, training_loop
@@ -119,26 +120,21 @@ def test_without_a_training_past_policies_are_left_out(runs):
     assert state.driver.shape == ()
     config = smoke("unused", "traffic=pool", f"traffic.members=[past,{runs[0]},idm]")
     assert not trusted_targets.find_outside_targets({"traffic": config["traffic"]})
-    told = circumstances.describe(config)["Background traffic"]
-    assert told == f"one of `past`, `{runs[0].name}`, `idm` in each episode; past policies in training only"
+    told = lambda *members: circumstances.describe({"traffic": config["traffic"] | {"members": [*members]}})["Background traffic"]  # noqa: E731
+    absent = "without the past policies that drive in training"
+    assert told("past", str(runs[0]), "idm") == f"one of `{runs[0].name}`, `idm` in each episode, {absent}"
+    assert told("past") == f"`log`, {absent}" and told("idm", "log") == "one of `idm`, `log` in each episode"
 
 
-def probe_with_past(every):
-    """A probe that pays the number of past policies and the sum of their first bias, beside what it pays anyway."""
-    env = probe(life=2, episode_steps=3)
+def test_an_evaluation_says_that_past_policies_are_missing(tmp_path, monkeypatch, capsys):
+    def stop(*_, **__):
+        raise SceneError("none")
 
-    def bind(parameters, there):
-        bias = jax.tree.leaves(parameters)[0]
-        value = jnp.sum(jnp.where(there, bias.reshape(len(bias), -1).sum(1), 0.0))
-
-        def control_step(scene, state, action):
-            after, result = env.control_step(scene, state, action)
-            terms = {name: jnp.full(len(state.active), number) for name, number in (("past", value), ("there", there.sum() * 1.0))}
-            return after, replace(result, terms=result.terms | terms)
-
-        return env._replace(control_step=control_step)
-
-    return env._replace(past=PastPolicies(2, every, bind))
+    monkeypatch.setattr(scene_source, "load_heldout_scenes", stop)
+    for members, said in (("past,idm", "background traffic: `idm`, without the past policies that drive in training\n"), ("idm", "")):
+        with pytest.raises(SceneError):
+            evaluate.evaluate_run(smoke(tmp_path, "traffic=pool", f"traffic.members=[{members}]"), tmp_path)
+        assert capsys.readouterr().out == said
 
 
 def make_probe_trainer(learner, env, seen):
@@ -155,7 +151,7 @@ def make_probe_trainer(learner, env, seen):
 @pytest.mark.parametrize("learner", ["ppo", pytest.param("sac", marks=pytest.mark.slow)])
 def test_a_training_keeps_the_latest_policies_and_resumes_bit_for_bit(tmp_path, learner):
     seen, every, taken = [], 2, []
-    trainer, stage = make_probe_trainer(learner, probe_with_past(every), seen), scenes(4)
+    trainer, stage = make_probe_trainer(learner, probe_with_past(every, life=2, episode_steps=3), seen), scenes(4)
     state = trainer.init(jax.random.key(0), stage)
     first = jax.device_get(state.parameters)
     jax.tree.map(lambda kept, own: np.testing.assert_array_equal(kept[0], own), state.past.parameters, first)
@@ -222,6 +218,7 @@ def checkpoint_arrays(folder, name):
         (["past"], {"past": {"slots": 0, "every": 1}}, r"^traffic\.past\.slots: expected an integer >= 1, got 0"),
         (["past"], {"kinds": {}}, r"^traffic\.kinds\.log: missing; it takes the place of past policies"),
         (["idm"], {"kinds": {"past": {}}}, r"^traffic\.kinds\.past: expected another name"),
+        (["idm"], {"vehicles": {"run": "town"}}, r"^traffic\.vehicles\.run: expected null, got 'town'; traffic\.members has"),
     ],
 )
 def test_mistakes_are_named(members, changes, message):

@@ -12,7 +12,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from scenefactory_jax.core import schema
-from scenefactory_jax.core.types import Env, Events, Motion, RouteState, Scene, State, StepMetrics, StepResult
+from scenefactory_jax.core.pytree import replace
+from scenefactory_jax.core.types import Env, Events, Motion, PastPolicies, RouteState, Scene, State, StepMetrics, StepResult
 from scenefactory_jax.learning.networks import late_fusion
 from scenefactory_jax.learning.ppo import train_iteration
 from scenefactory_jax.learning.ppo.config import PPOConfig
@@ -130,6 +131,24 @@ def expert(scenes, worlds, key):
     cue = worlds.state.body
     known = (cue > 0) | (jnp.arange(AGENTS) != 1)
     return jnp.stack([jnp.where(known, 0.5 * cue, 0.9), jnp.full_like(cue, STEERS), jnp.zeros_like(cue)], axis=-1), known
+
+
+def probe_with_past(every, **numbers):
+    """A probe that pays the number of past policies and the sum of their first bias, beside what it pays anyway."""
+    env = probe(**numbers)
+
+    def bind(parameters, there):
+        bias = jax.tree.leaves(parameters)[0]
+        value = jnp.sum(jnp.where(there, bias.reshape(len(bias), -1).sum(1), 0.0))
+
+        def control_step(scene, state, action):
+            after, result = env.control_step(scene, state, action)
+            terms = {name: jnp.full(len(state.active), number) for name, number in (("past", value), ("there", there.sum() * 1.0))}
+            return after, replace(result, terms=result.terms | terms)
+
+        return env._replace(control_step=control_step)
+
+    return env._replace(past=PastPolicies(2, every, bind))
 
 
 def scenes(worlds: int, task: int = 5) -> Scene:

@@ -2,7 +2,7 @@
 
     python sharding.py DEVICES:SHARDS[:PAST][,DEVICES:SHARDS ...] [COORDINATOR PROCESSES INDEX]
 
-PAST: of two past policies the newest replaces the oldest every so many iterations. The probe has no traffic that they would drive.
+PAST: of two past policies, which the probe reads, the newest replaces the oldest every so many iterations.
 """
 
 import itertools
@@ -17,11 +17,10 @@ if len(sys.argv) > 2:
 import numpy as np
 
 from scenefactory_jax.core import sharding
-from scenefactory_jax.core.types import PastPolicies
 from scenefactory_jax.learning import past_policies
 from scenefactory_jax.learning.networks import late_fusion
 from scenefactory_jax.learning.trainer import get_policy_parameters
-from support.probes import SMALL, make_trainer, probe, scenes
+from support.probes import SMALL, make_trainer, probe, probe_with_past, scenes
 
 WORLDS = 8
 COMPILED = ("jit(train_iteration)", "jit(replace_scenes)")
@@ -35,8 +34,8 @@ def learn(devices, shards, every=None):
     if every is None:
         trainer = make(env)
     else:
-        bound = env._replace(past=PastPolicies(2, every, lambda *past: env))
-        trainer = past_policies.add_past_policies(make, bound, late_fusion.make(**SMALL), mesh=mesh)
+        watched = probe_with_past(every, life=5, episode_steps=6)
+        trainer = past_policies.add_past_policies(make, watched, late_fusion.make(**SMALL), mesh=mesh)
     stage = sharding.place_on_devices(jax.tree.map(np.asarray, scenes(WORLDS)), mesh)
     fresh = sharding.place_on_devices(jax.tree.map(np.asarray, scenes(WORLDS // 2, task=2)), mesh)
     compiled, history = [], []
