@@ -125,7 +125,7 @@ class Attention(nn.Module):
         keys, values = keys_values
         queries = self._split(self.query(x))
         mask = jnp.ones((*keys.shape[:1], 1, keys.shape[1]), bool) if mask is None else mask
-        if self.numbers.kernels and mask.shape[1] == 1 and attention_kernel.fits(queries):
+        if self.numbers.kernels and mask.shape[1] == 1 and attention_kernel.fits(queries) and pallas.knows_gpus():
             found = attend(queries, keys, values, mask[:, 0])
         else:
             found = attend_plainly(queries, keys, values, mask)
