@@ -501,6 +501,12 @@ def test_studies_share_what_they_train_alike(alike, tmp_path):
     assert len(same) == 1
 
 
+def test_overrides_within_overrides_are_written_out(tmp_path):
+    entry = toy(tmp_path, **{**ALONE, "trainings": {"all scenes": [[["ppo.gamma=0.5"], "ppo.clip_eps=0.1"], "ppo.gamma=0.6"]}})
+    training, _ = study_plan.make(entry).trainings
+    assert training.config["ppo"]["gamma"] == 0.6 and training.config["ppo"]["clip_eps"] == 0.1
+
+
 def test_later_overrides_win():
     assert study_plan.merge_overrides(["a=1", "b.c=2", "a=3", "~d", "+b.c=4"]) == ["a=3", "~d", "+b.c=4"]
 

@@ -140,6 +140,6 @@ def test_gpus_that_kernels_were_not_measured_on_get_plain_jax(capability, made, 
     one = encoder_modules.LatentQuery(lambda _: blocks, numbers, "bfloat16", latents=16, width=32, rounds=1)
     parameters = jax.eval_shape(lambda key: one.init(key, {}), jax.random.key(0))
     with abstract_gpu():
-        steep = jax.jit(jax.grad(lambda parameters: one.apply(parameters, {}).sum()))
+        steep = jax.jit(jax.grad(lambda parameters: one.apply(parameters, {}).sum()))  # pyright: ignore[reportAttributeAccessIssue]
         text = steep.trace(parameters).lower(lowering_platforms=("cuda",)).as_text()
     assert [name in text for name in ("attend_gradient", "add_residual_gradient", "embed_rows_gradient")] == [made] * 3

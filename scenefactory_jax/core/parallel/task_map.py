@@ -132,7 +132,7 @@ class _Pool:
                 busy.end(signal.SIGKILL)
 
     def close(self, number: int | None) -> None:
-        """Ends the processes by a signal, or, without one, after their tasks. One that compiles, for minutes, obeys no signal: it is killed."""
+        """Ends the processes by a signal, or, without one, after their tasks. One that obeys no signal, as it compiles, is killed."""
         self._closed, end = True, time.monotonic() + PATIENCE_S
         for one in self._workers:  # all get the signal before the first is waited for
             if number is not None:

@@ -35,7 +35,7 @@ class Transformer:
     heads: Count
     head_features: Count
     feed_forward: Count  # hidden width of a feed-forward part, in widths of its input
-    kernels: bool  # Triton kernels on NVIDIA GPUs, where they fit
+    kernels: bool  # Triton kernels on an H100 or H200, where they fit
 
     def __post_init__(self) -> None:
         if not self.embedding:

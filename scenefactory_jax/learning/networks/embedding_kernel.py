@@ -41,7 +41,7 @@ def fits(dtype: str, weights: Weights, x: Float[Array, "*batch F"]) -> bool:
 
 
 def embed(dtype: str, weights: Weights, x: Float[Array, "*batch F"]) -> Float[Array, "*batch D"]:
-    """Applies dense layers with ReLU between them; layers after the first multiply in `dtype`. Kernels on GPUs that are known, if they fit."""
+    """Applies dense layers with ReLU between them; layers after the first in `dtype`. Kernels on GPUs that are known, if they fit."""
     quick, plain = functools.partial(embed_quick, dtype), functools.partial(embed_plain, dtype)
     return pallas.on_gpu(quick, plain, weights, x) if fits(dtype, weights, x) and pallas.knows_gpus() else plain(weights, x)
 
