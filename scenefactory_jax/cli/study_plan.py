@@ -21,6 +21,7 @@ LEARNER = (*TASK, "termination", "policy", "learner", "ppo", "devices")  # group
 # Keys that do not change what is learnt
 IGNORED = ("name", "out", "resume", "progress", "loggers", "checkpoint_every", "checkpoints_kept", "evaluation")
 ACTOR = ("actor", "values")  # of a learner, that decide what network its policy is
+SHARED = ("seed", "repeats", "planner_overrides")  # of a protocol: those of the study's decide for all conditions
 TRAINED, UNTRAINED = "checkpoints", "untrained"  # weights: a run's checkpoints, or those before training
 
 
@@ -178,10 +179,14 @@ def _load_protocol(config: Mapping[str, Any], condition: str) -> ConditionProtoc
     settings, protocol = list_evaluation_overrides(config), config["protocol"]
     names = config["study"]["protocols"]
     if named := [override for override in overrides if override.startswith("protocol=")]:
+        load = lambda override: configs.load_config("evaluate", "run=null", override)["protocol"]  # noqa: E731
         try:
-            protocol = configs.load_config("evaluate", "run=null", named[-1])["protocol"]
+            protocol, own = load(named[-1]), load(f"protocol={protocol['name']}")
         except ConfigError as error:
             raise ConfigError(f"study.conditions.{condition}: {error}") from None
+        for key in SHARED:
+            if protocol.get(key) != own.get(key):
+                raise ConfigError(f"study.conditions.{condition}: {named[-1]} has other {key} than the study's protocol; expected the same")
         settings, names = configs.list_overrides(protocol["settings"]), protocol["termination"]
     others = [override for override in overrides if override not in named]
     return ConditionProtocol([*settings, *others], protocol.get("scores"), load_terminations(names))
