@@ -47,7 +47,7 @@ def study(config: Mapping[str, Any]) -> dict[str, Any]:
     """
     single = {name: [config[name]] for name in ("parts", "only", "seeds") if isinstance(config[name], (str, int))}
     deadline, config = time.time() + (math.inf if config["time_limit_s"] is None else config["time_limit_s"]), {**config, **single}
-    config = study_plan.add_planners(config)
+    config = study_plan.complete(config)
     if config["parts"] == ["draw"]:
         return study_results.draw(config)
     plan = study_plan.make(config)

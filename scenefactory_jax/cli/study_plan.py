@@ -21,6 +21,7 @@ LEARNER = (*TASK, "termination", "policy", "learner", "ppo", "devices")  # group
 # Keys that do not change what is learnt
 IGNORED = ("name", "out", "resume", "progress", "loggers", "checkpoint_every", "checkpoints_kept", "evaluation")
 ACTOR = ("actor", "values")  # of a learner, that decide what network its policy is
+SHARED = ("seed", "repeats", "planner_overrides")  # of a protocol: those of the study's decide for all conditions
 TRAINED, UNTRAINED = "checkpoints", "untrained"  # weights: a run's checkpoints, or those before training
 
 
@@ -74,7 +75,7 @@ def make(config: Mapping[str, Any]) -> Plan:
     Raises:
         ConfigError: a key, a name or an override that does not fit, naming the variant or condition.
     """
-    config = add_planners(config)
+    config = complete(config)
     check(config)
     digest_files.cache_clear()  # the files may have changed since this process planned last
     study, protocols = config["study"], {name: _load_protocol(config, name) for name in config["study"]["conditions"]}
@@ -139,11 +140,15 @@ def check(config: Mapping[str, Any]) -> None:
         raise ConfigError(f"study.baselines: expected names that no variant has, got {sorted(doubled)[0]!r}")
 
 
-def add_planners(config: Mapping[str, Any]) -> dict[str, Any]:
-    """Adds the study's `planners` to its baselines, with the overrides that they have in `evaluate` under its protocol."""
+def complete(config: Mapping[str, Any]) -> dict[str, Any]:
+    """Writes out what a study says in short: lists of overrides within those of its trainings, such as an anchor of YAML repeats, and its
+    `planners`, baselines with the overrides that they have in `evaluate` under its protocol.
+    """
     study, protocol = config["study"], config["protocol"]
+    study = {**study, "trainings": {name: _flatten(overrides) for name, overrides in study["trainings"].items()}}
+    config = {**config, "study": study}
     if not study["planners"] or not study["trainings"]:
-        return dict(config)
+        return config
     known = configs.load_config("evaluate", "run=null", f"protocol={protocol['name']}")["planner_overrides"]
     own = protocol.get("planner_overrides", {})
     if unknown := [name for name in study["planners"] if name not in known]:
@@ -151,6 +156,13 @@ def add_planners(config: Mapping[str, Any]) -> dict[str, Any]:
     first = {"of": next(iter(study["trainings"])), "conditions": None, "seeds": 1}
     planners = {name: {**first, "overrides": [*known[name], *own.get(name, [])]} for name in study["planners"]}
     return {**config, "study": {**study, "planners": [], "baselines": {**study["baselines"], **planners}}}
+
+
+def _flatten(overrides: Any) -> Any:
+    """The overrides of nested lists in one; what is no list stays, for `check`."""
+    if not isinstance(overrides, list):
+        return overrides
+    return [one for entry in overrides for one in (_flatten(entry) if isinstance(entry, list) else [entry])]
 
 
 class ConditionProtocol(NamedTuple):
@@ -167,10 +179,14 @@ def _load_protocol(config: Mapping[str, Any], condition: str) -> ConditionProtoc
     settings, protocol = list_evaluation_overrides(config), config["protocol"]
     names = config["study"]["protocols"]
     if named := [override for override in overrides if override.startswith("protocol=")]:
+        load = lambda override: configs.load_config("evaluate", "run=null", override)["protocol"]  # noqa: E731
         try:
-            protocol = configs.load_config("evaluate", "run=null", named[-1])["protocol"]
+            protocol, own = load(named[-1]), load(f"protocol={protocol['name']}")
         except ConfigError as error:
             raise ConfigError(f"study.conditions.{condition}: {error}") from None
+        for key in SHARED:
+            if protocol.get(key) != own.get(key):
+                raise ConfigError(f"study.conditions.{condition}: {named[-1]} has other {key} than the study's protocol; expected the same")
         settings, names = configs.list_overrides(protocol["settings"]), protocol["termination"]
     others = [override for override in overrides if override not in named]
     return ConditionProtocol([*settings, *others], protocol.get("scores"), load_terminations(names))

@@ -8,6 +8,16 @@ import jax.numpy as jnp
 from jax.experimental import pallas as pl
 from jaxtyping import Array, Bool, Int
 
+MEASURED = "9.0"  # compute capability of the GPUs (H100, H200) on which kernels that fill a processor's memory were measured
+
+
+def knows_gpus() -> bool:
+    """Whether this process's GPUs, if it has any, are those of `MEASURED`: others may have too little shared memory."""
+    try:
+        return all(device.compute_capability == MEASURED for device in jax.local_devices(backend="cuda"))
+    except RuntimeError:  # no GPU: a program that is only lowered
+        return True
+
 
 def on_gpu(quick: Callable, plain: Callable, *arguments: Any) -> Any:
     """`quick` on NVIDIA GPUs, `plain` elsewhere."""

@@ -501,6 +501,18 @@ def test_studies_share_what_they_train_alike(alike, tmp_path):
     assert len(same) == 1
 
 
+def test_a_condition_by_a_protocol_of_other_episodes_is_refused(tmp_path):
+    entry = toy(tmp_path, **{**ALONE, "conditions": {"dry": ["protocol=wosac"]}})
+    with pytest.raises(ConfigError, match=r"study\.conditions\.dry: protocol=wosac has other repeats than the study's protocol"):
+        study_plan.make(entry)
+
+
+def test_overrides_within_overrides_are_written_out(tmp_path):
+    entry = toy(tmp_path, **{**ALONE, "trainings": {"all scenes": [[["ppo.gamma=0.5"], "ppo.clip_eps=0.1"], "ppo.gamma=0.6"]}})
+    training, _ = study_plan.make(entry).trainings
+    assert training.config["ppo"]["gamma"] == 0.6 and training.config["ppo"]["clip_eps"] == 0.1
+
+
 def test_later_overrides_win():
     assert study_plan.merge_overrides(["a=1", "b.c=2", "a=3", "~d", "+b.c=4"]) == ["a=3", "~d", "+b.c=4"]
 

@@ -3,10 +3,12 @@
 import multiprocessing
 import os
 import signal
+import threading
 import time
 
 import pytest
 
+from scenefactory_jax.core.parallel import task_map as pools
 from scenefactory_jax.core.parallel.task_map import open_pool
 
 
@@ -76,6 +78,28 @@ def test_an_error_ends_busy_workers(tmp_path):
     for path in tmp_path.iterdir():
         with pytest.raises(ProcessLookupError):
             os.kill(int(path.name), 0)
+
+
+def work_on(path):
+    """Obeys no SIGTERM, as a process that compiles."""
+    signal.signal(signal.SIGTERM, signal.SIG_IGN)
+    path.write_text(str(os.getpid()))
+    time.sleep(600)
+
+
+def test_processes_that_do_not_stop_are_killed(tmp_path, monkeypatch):
+    monkeypatch.setattr(pools, "PATIENCE_S", 0.5)
+    paths = [tmp_path / "first", tmp_path / "second"]
+    with pytest.raises(SystemExit), open_pool(2, stops=True) as task_map:
+        results = threading.Thread(target=list, args=(task_map(work_on, paths),), daemon=True)
+        results.start()
+        until(lambda: all(path.is_file() and path.read_text() for path in paths))
+        begun = time.monotonic()
+        raise SystemExit(143)
+    assert time.monotonic() - begun < 20.0
+    for path in paths:
+        with pytest.raises(ProcessLookupError):
+            os.kill(int(path.read_text()), 0)
 
 
 def twice(item):

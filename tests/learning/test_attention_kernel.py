@@ -1,6 +1,7 @@
 """The kernels of attention and of residual parts against plain JAX, in Pallas's interpreter; that they lower to a GPU's code."""
 
 import functools
+import types
 
 import jax
 import jax.numpy as jnp
@@ -8,7 +9,8 @@ import numpy as np
 import pytest
 from support.abstract_gpu import abstract_gpu
 
-from scenefactory_jax.learning.networks import attention, attention_kernel, residual, residual_kernel
+from scenefactory_jax.env.observations.vmax import Block
+from scenefactory_jax.learning.networks import attention, attention_kernel, encoder_modules, residual, residual_kernel
 
 pytestmark = pytest.mark.usefixtures("quickly")
 interpreted = functools.partial(functools.partial, interpret=True)
@@ -126,3 +128,18 @@ def test_a_gpu_gets_kernels_and_other_devices_plain_jax(dtype):
     on_gpu = text(True, "cuda")
     assert all(name in on_gpu for name in ("attend", "attend_gradient", "add_residual", "add_residual_gradient"))
     assert "triton" not in text(True, "cpu") and "triton" not in text(False, "cuda")
+
+
+@pytest.mark.parametrize(("capability", "made"), [("9.0", True), ("8.6", False)])
+def test_gpus_that_kernels_were_not_measured_on_get_plain_jax(capability, made, monkeypatch):
+    """With less shared memory a kernel may not start: attention, residual part and embedding ask the same question."""
+    monkeypatch.setattr(jax, "local_devices", lambda *, backend: [types.SimpleNamespace(compute_capability=capability)])
+    numbers = attention.Transformer((64, 64, 32), heads=2, head_features=16, feed_forward=2, kernels=True)
+    [features] = draw(0, (4, 5, 1, 7))
+    blocks = {"others": Block(features, jnp.ones(features.shape[:3], bool))}
+    one = encoder_modules.LatentQuery(lambda _: blocks, numbers, "bfloat16", latents=16, width=32, rounds=1)
+    parameters = jax.eval_shape(lambda key: one.init(key, {}), jax.random.key(0))
+    with abstract_gpu():
+        steep = jax.jit(jax.grad(lambda parameters: one.apply(parameters, {}).sum()))  # pyright: ignore[reportAttributeAccessIssue]
+        text = steep.trace(parameters).lower(lowering_platforms=("cuda",)).as_text()
+    assert [name in text for name in ("attend_gradient", "add_residual_gradient", "embed_rows_gradient")] == [made] * 3

@@ -45,8 +45,9 @@ class TaskClaims:
 def run_on_gpus(work: Callable[..., Any], processes: int, *arguments: Any, per_gpu: int = 1) -> list[Any]:
     """Computes `work(index, *arguments)` in each process.
 
-    An error or SIGTERM in this process ends the others first (a training after its iteration), so that their results can be used; Ctrl-C
-    reaches all processes of a terminal. Raises RuntimeError after all have ended, if one ended with an error, which it has printed.
+    An error or SIGTERM in this process ends the others first (a training after its iteration, or after its last checkpoint where that takes
+    longer than `open_pool` waits), so that their results can be used; Ctrl-C reaches all processes of a terminal. Raises RuntimeError after
+    all have ended, if one ended with an error, which it has printed.
 
     Args:
         per_gpu: processes that share a GPU and its memory: while one compiles on the CPU, the others compute.

@@ -9,6 +9,7 @@ import contextlib
 import importlib
 import pickle
 import signal
+import time
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from multiprocessing.connection import wait
@@ -20,6 +21,7 @@ from scenefactory_jax.core.raw_scene import SceneError
 from scenefactory_jax.core.schema import ConfigError, Count, Positive
 
 IN_PROCESS = "spread=local scenes.workers=1 spread.timeout_s=null works without other processes"
+PATIENCE_S = 20.0  # for processes that are asked to stop, before they are killed; schedulers kill after 30 s
 NO_ACCELERATOR = {"JAX_PLATFORMS": "cpu"}
 Work = Callable[[Any], Any]
 TaskMap = Callable[[Work, Sequence[Any]], Iterable[Any]]
@@ -35,7 +37,7 @@ def open_pool(
         workers: processes; 0: this process.
         timeout_s: limit of one item.
         environments: variables of each process; item i of a call goes to process i first. None: the accelerator is left to this process.
-        stops: the processes obey signals to stop, and are asked to stop (SIGTERM) rather than killed.
+        stops: the processes obey signals to stop, and are asked to stop (SIGTERM), and killed only if they do not within `PATIENCE_S`.
     """
     if not workers:
         yield in_process
@@ -130,13 +132,13 @@ class _Pool:
                 busy.end(signal.SIGKILL)
 
     def close(self, number: int | None) -> None:
-        """Ends the processes by a signal, or, without one, after their tasks."""
-        self._closed = True
+        """Ends the processes by a signal, or, without one, after their tasks. One that obeys no signal, as it compiles, is killed."""
+        self._closed, end = True, time.monotonic() + PATIENCE_S
         for one in self._workers:  # all get the signal before the first is waited for
             if number is not None:
                 one.process.send_signal(number)
         for one in list(self._workers):
-            one.end(number)
+            one.end(number, patience_s=None if number is None else max(0.0, end - time.monotonic()))
 
     def _assign(self, packed: bytes, waiting: deque[tuple[int, Any]]) -> None:
         """Sends the next items to idle processes, and to new ones up to their number."""

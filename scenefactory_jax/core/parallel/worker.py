@@ -59,13 +59,17 @@ class Worker:
             return f"its process was ended by {name}" + (", perhaps for want of memory" if name == "SIGKILL" else "")
         return f"its process ended with code {code}"
 
-    def end(self, number: int | None) -> None:
-        """Ends the process by a signal, or, without one, after its task."""
+    def end(self, number: int | None, *, patience_s: float | None = None) -> None:
+        """Ends the process by a signal, or, without one, after its task; kills it if it has not ended after `patience_s`."""
         if number is None:
             self.connection.close()
         else:
             self.process.send_signal(number)
-        self.process.wait()
+        try:
+            self.process.wait(patience_s)
+        except subprocess.TimeoutExpired:
+            self.process.kill()
+            self.process.wait()
 
 
 def serve(descriptor: str, parent: str, stops: str) -> None:

@@ -35,7 +35,7 @@ class Transformer:
     heads: Count
     head_features: Count
     feed_forward: Count  # hidden width of a feed-forward part, in widths of its input
-    kernels: bool  # Triton kernels on NVIDIA GPUs, where they fit
+    kernels: bool  # Triton kernels on an H100 or H200, where they fit
 
     def __post_init__(self) -> None:
         if not self.embedding:
@@ -125,7 +125,7 @@ class Attention(nn.Module):
         keys, values = keys_values
         queries = self._split(self.query(x))
         mask = jnp.ones((*keys.shape[:1], 1, keys.shape[1]), bool) if mask is None else mask
-        if self.numbers.kernels and mask.shape[1] == 1 and attention_kernel.fits(queries):
+        if self.numbers.kernels and mask.shape[1] == 1 and attention_kernel.fits(queries) and pallas.knows_gpus():
             found = attend(queries, keys, values, mask[:, 0])
         else:
             found = attend_plainly(queries, keys, values, mask)

@@ -27,7 +27,6 @@ ROWS = 128  # of a tile
 CHANNELS = 64  # of a tile of hidden values
 INPUTS = 16  # columns of a row on the chip: its features, a one for the bias, zeros
 HIDDEN, OUTPUTS = (64, 128, 192, 256), (32, 64)  # widths; more do not fit into registers and shared memory
-CAPABILITY = "9.0"  # of GPUs that the kernels were measured on (H100, H200); others have less shared memory
 MAX_SIZE = 2**31  # entries of an array, whose places are int32
 
 
@@ -41,18 +40,10 @@ def fits(dtype: str, weights: Weights, x: Float[Array, "*batch F"]) -> bool:
     return {*widths[:2]} <= {*HIDDEN} and widths[2] in OUTPUTS and 0 < x.size // features * max(features, *widths) < MAX_SIZE
 
 
-def _known_gpu() -> bool:
-    """Whether GPUs, if there are any, are those that the kernels are for."""
-    try:
-        return all(device.compute_capability == CAPABILITY for device in jax.local_devices(backend="cuda"))
-    except RuntimeError:  # no GPU: a program that is only lowered
-        return True
-
-
 def embed(dtype: str, weights: Weights, x: Float[Array, "*batch F"]) -> Float[Array, "*batch D"]:
-    """Applies dense layers with ReLU between them; layers after the first multiply in `dtype`. Kernels on an H100, if they fit."""
+    """Applies dense layers with ReLU between them; layers after the first in `dtype`. Kernels on GPUs that are known, if they fit."""
     quick, plain = functools.partial(embed_quick, dtype), functools.partial(embed_plain, dtype)
-    return pallas.on_gpu(quick, plain, weights, x) if fits(dtype, weights, x) and _known_gpu() else plain(weights, x)
+    return pallas.on_gpu(quick, plain, weights, x) if fits(dtype, weights, x) and pallas.knows_gpus() else plain(weights, x)
 
 
 def embed_plain(dtype: str, weights: Weights, x: Float[Array, "*batch F"]) -> Float[Array, "*batch D"]:
