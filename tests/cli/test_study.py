@@ -216,16 +216,16 @@ def test_findings_are_those_that_holm_leaves_in_a_family():
 
 def test_a_condition_may_name_a_protocol(tmp_path):
     """Its settings, scores and terminations take the place of the study's; planners have their overrides of `evaluate`."""
-    conditions = {"dry": [], "planned": ["protocol=vmax_noise", "timing=waymax"]}
-    plan = study_plan.make(toy(tmp_path, **{**ALONE, "conditions": conditions, "planners": ["idm_route"]}))
+    conditions = {"plain": ["timing=waymax"], "noisy": ["protocol=vmax_noise", "timing=waymax"]}
+    plan = study_plan.make(toy(tmp_path, "protocol=vmax", **{**ALONE, "conditions": conditions, "planners": ["idm_route"]}))
     by_condition = {one.condition: one for one in plan.evaluations if one.row == "all scenes"}
-    assert by_condition["dry"].scores is None and by_condition["planned"].scores["noise"]["redraws"] == 8
-    assert [one.protocol for one in by_condition.values()] == ["strict", "whole"]
-    assert by_condition["planned"].config["timing"]["control_hz"] == 10 and by_condition["planned"].config["scenes"]["pack"]["agents"] == 1
+    assert "noise" not in by_condition["plain"].scores and by_condition["noisy"].scores["noise"]["redraws"] == 8
+    assert by_condition["noisy"].config["timing"]["control_hz"] == 10 and by_condition["noisy"].config["scenes"]["pack"]["agents"] == 1
     planner = next(one for one in plan.evaluations if one.row == "idm_route")
     assert planner.config["policy"]["_target_"].endswith("idm_route.make") and planner.weights == study_plan.UNTRAINED
     for changes, message in (
         ({"conditions": {"x": ["protocol=vmix"]}}, r"study\.conditions\.x: .*protocol"),
+        ({"conditions": {"x": ["protocol=vmax"]}}, r"study\.conditions\.x: protocol=vmax has other planner_overrides"),
         ({"planners": ["pilot"]}, r"study\.planners: expected names of log, expert, .*got 'pilot'"),
     ):
         with pytest.raises(ConfigError, match=message):

@@ -566,11 +566,14 @@ PLANNERS = tuple(f"policy={name}" for name in ("pure_pursuit", "route_pursuit", 
 FOR_PLANNERS = ("observations=planning", "observations=log", "observations=noise")
 
 
+PARTS = ("base", "cloning")  # files of options that are none
+
+
 def option_sets():
     """Sets of options, one of each group, which together have every option of every group once or more."""
     others = ("command", "hydra_settings", "task", "experiment", "protocol", "spread", "study", "suite", "sysid", "tracker", "validation")
     folders = [folder for folder in sorted(hydra_config.find_conf().iterdir()) if folder.is_dir() and folder.name not in others]
-    groups = [[f"{folder.name}={path.stem}" for path in sorted(folder.glob("*.yaml")) if path.stem != "base"] for folder in folders]
+    groups = [[f"{folder.name}={path.stem}" for path in sorted(folder.glob("*.yaml")) if path.stem not in PARTS] for folder in folders]
     apart = (*PLANNERS, *FOR_PLANNERS, "timing=waymax")  # not trained, or not with every action repeat; see below
     groups = [[option for option in options if option not in apart] for options in groups]
     return [[options[i % len(options)] for options in groups if options] for i in range(max(map(len, groups)))]
