@@ -53,7 +53,7 @@ def _add(dtype: str, x: Array, found: Array, scale: Array, weights: Weights) -> 
 
 def _add_forward(dtype: str, x: Array, found: Array, scale: Array, weights: Weights) -> tuple[Array, tuple]:
     def plain(x: Array, *others: Any) -> tuple[Array, Array]:
-        return add_plainly(dtype, x, *others), jnp.zeros_like(x, dtype)  # nobody reads them
+        return add_plainly(dtype, x, *others), jnp.zeros_like(x, dtype)  # no gradient of plain JAX needs the middle
 
     y, middle = pallas.on_gpu(functools.partial(residual_kernel.add, dtype), plain, x, found, scale, weights)
     return y, (x, found, scale, weights, middle)
