@@ -316,14 +316,9 @@ def get_axis(mesh: Mesh | None) -> str | None:
     return None if mesh is None else sharding.AXIS
 
 
-def count_starts(env: Env, config: OffPolicyConfig, *, episode_steps: int) -> int:
-    """Counts the actions at which an episode may start, see `trainer.start_worlds`."""
-    return episode_steps // env.action_repeat if config.stagger_episodes else 1
-
-
 def make_trainer(rounds: Rounds, policy: Policy, *, episode_steps: int, mesh: Mesh | None) -> Trainer:
     """Builds the trainer of a single learner; `episode_steps` and `mesh` as of PPO."""
-    starts = count_starts(rounds.env, rounds.config, episode_steps=episode_steps)
+    starts = trainer.count_starts(rounds.env, episode_steps, staggered=rounds.config.stagger_episodes)
     init = functools.partial(init_train_state, [rounds], policy=policy, starts=starts)
     iterate, recorded = functools.partial(train_iteration, rounds), rounds.name if rounds.learner.act is None else None
     return trainer.compile_trainer(init, iterate, rounds.env, starts=starts, mesh=mesh, recorded=recorded)

@@ -102,6 +102,11 @@ def init_train_state(
     return copy_leaves(train_state)
 
 
+def count_starts(env: Env, episode_steps: int, *, staggered: bool) -> int:
+    """Counts the actions at which an episode may start, see `start_worlds`."""
+    return episode_steps // env.action_repeat if staggered else 1
+
+
 def start_worlds(env: Env, key: PRNGKeyArray, scenes: Scene, *, starts: int = 1) -> Worlds:
     """Starts an episode in every world, each at one of its first `starts` actions, at random; 1: all at the beginning."""
     return start_each_world(env, jax.random.split(key, jax.tree.leaves(scenes)[0].shape[0]), scenes, starts=starts)

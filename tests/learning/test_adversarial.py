@@ -9,12 +9,13 @@ import pytest
 from scipy import stats
 from support.adversarial import GAMMA, POLICY, make_discriminator, make_learner, make_numbers
 from support.probes import STEERS, expert, ppo_config, probe, scenes
+from support.resuming import check_resumed_is_unbroken
 
 from scenefactory_jax.cli import hydra_config as configs
 from scenefactory_jax.core.pytree import replace
 from scenefactory_jax.core.schema import ConfigError
 from scenefactory_jax.core.types import Policy
-from scenefactory_jax.learning import checkpoint, off_policy, replay_buffer, trainer
+from scenefactory_jax.learning import off_policy, replay_buffer, trainer
 from scenefactory_jax.learning.adversarial import airl, gail, train_iteration
 from scenefactory_jax.learning.adversarial.config import AdversarialConfig
 from scenefactory_jax.learning.adversarial.discriminator import Discriminator, Pairs, compute_loss
@@ -127,20 +128,7 @@ def test_the_policy_does_as_the_expert_from_what_is_observed(course, name):
 @pytest.mark.parametrize("name", ["gail", "airl"])
 def test_a_killed_and_resumed_run_is_the_unbroken_one(course, name, tmp_path):
     learner, stage = course(name), scenes(WORLDS, 1)
-    unbroken, states = learner.init(jax.random.key(1), stage), []
-    for iteration in range(4):
-        unbroken, _ = learner.train_iteration(unbroken, stage)
-        if iteration == 1:
-            checkpoint.save(tmp_path, unbroken, keep=1)
-    resumed = checkpoint.restore(tmp_path, learner.init(jax.random.key(9), stage))
-    for _ in range(2):
-        resumed, _ = learner.train_iteration(resumed, stage)
-    for index, state in enumerate((unbroken, resumed)):
-        checkpoint.save(tmp_path / str(index), state, keep=1)
-        states.append(np.load(tmp_path / str(index) / "4.npz"))
-    assert states[0].files == states[1].files
-    for leaf in states[0].files:
-        np.testing.assert_array_equal(states[0][leaf], states[1][leaf], err_msg=leaf)
+    check_resumed_is_unbroken(learner, stage, tmp_path)
 
 
 def test_only_pairs_of_the_expert_that_are_known_are_stored(course):

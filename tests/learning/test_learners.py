@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from scipy import stats
 from support.probes import LEARNERS, SMALL, STEERS, make_learner, probe, scenes
+from support.resuming import check_resumed_is_unbroken
 
 from scenefactory_jax.cli import hydra_config as configs
 from scenefactory_jax.core import schema
@@ -155,20 +156,7 @@ def test_probe_5_action_that_depends_on_the_observation(course, name):
 def test_a_killed_and_resumed_run_is_the_unbroken_one(course, name, tmp_path):
     _, learner = course(name)
     stage = scenes(WORLDS)
-    unbroken, states = learner.init(jax.random.key(1), stage), []
-    for iteration in range(4):
-        unbroken, _ = learner.train_iteration(unbroken, stage)
-        if iteration == 1:
-            checkpoint.save(tmp_path, unbroken, keep=1)
-    resumed = checkpoint.restore(tmp_path, learner.init(jax.random.key(9), stage))
-    for _ in range(2):
-        resumed, _ = learner.train_iteration(resumed, stage)
-    for state in (unbroken, resumed):
-        checkpoint.save(tmp_path / str(len(states)), state, keep=1)
-        states.append(np.load(tmp_path / str(len(states)) / "4.npz"))
-    assert states[0].files == states[1].files
-    for leaf in states[0].files:
-        np.testing.assert_array_equal(states[0][leaf], states[1][leaf], err_msg=leaf)
+    unbroken, _ = check_resumed_is_unbroken(learner, stage, tmp_path)
     parameters = checkpoint.restore_parameters(tmp_path / "0")
     jax.tree.map(np.testing.assert_array_equal, parameters, get_policy_parameters(unbroken))
 

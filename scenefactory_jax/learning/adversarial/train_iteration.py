@@ -230,8 +230,8 @@ def make_trainer(
     ppo, shards = ppo_iteration.make_constants(env, policy, ppo_config, mesh)
     if config.batch % shards:
         raise ConfigError(f"learner.batch: expected a multiple of {shards} shards, got {config.batch}")
-    actions = episode_steps // env.action_repeat
-    devices, starts = shards // ppo.groups, actions if ppo_config.stagger_episodes else 1
+    starts = trainer.count_starts(env, episode_steps, staggered=ppo_config.stagger_episodes)
+    actions, devices = episode_steps // env.action_repeat, shards // ppo.groups
     imitation = Imitation(name, ppo, discriminator, expert, config, numbers, config.expert_steps or actions, devices)
     iterate = functools.partial(train_iteration, imitation)
     begin, recorded = functools.partial(init, imitation, shards, starts), name if expert is None else None

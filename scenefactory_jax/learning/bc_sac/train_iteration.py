@@ -83,7 +83,7 @@ def make_trainer(
     cloner, learner = bc.make_learner(policy, imitation, expert, disturb, axis), sac.make_learner(policy, config, axis)
     reinforcing = off_policy.make_rounds("sac", env, learner, config, mesh)
     cloning = off_policy.make_rounds("bc", env, cloner, imitation, mesh, key="expert_buffer")
-    starts = off_policy.count_starts(env, config, episode_steps=episode_steps)
+    starts = trainer.count_starts(env, episode_steps, staggered=config.stagger_episodes)
     init = functools.partial(off_policy.init_train_state, [reinforcing, cloning], policy=policy, starts=starts)
     iterate = functools.partial(train_iteration, cloning, reinforcing, config.imitation_every, starts)
     recorded = cloning.name if expert is None else None

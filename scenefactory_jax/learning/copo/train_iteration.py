@@ -189,7 +189,7 @@ def make_trainer(
         ConfigError: shards that the devices do not divide.
     """
     ppo, shards = ppo_iteration.make_constants(env, policy, ppo_config, mesh)
-    copo, starts = CoPO(ppo, config), episode_steps // env.action_repeat if ppo_config.stagger_episodes else 1
+    copo, starts = CoPO(ppo, config), trainer.count_starts(env, episode_steps, staggered=ppo_config.stagger_episodes)
     iterate = functools.partial(train_iteration, copo)
     return trainer.compile_trainer(functools.partial(init, copo, shards, starts), iterate, env, starts=starts, mesh=mesh)
 

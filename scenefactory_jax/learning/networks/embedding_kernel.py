@@ -5,7 +5,7 @@ program computes a tile of rows from features to output. For the gradient a prog
 again for some channels of the second layer, and keeps the sums of the weights' gradients; sums of all programs are added up afterwards, in
 the same order every time.
 
-Arithmetic is that of plain JAX on the same GPU: products of float32 numbers in TF32, of bfloat16 numbers as they are. Sums and biases are
+Arithmetic is that of plain JAX on the same GPU: products of the first layer in TF32, of the others in bfloat16. Sums and biases are
 float32.
 """
 
@@ -108,7 +108,7 @@ def _encode(x, first, first_bias, second, second_bias, third, third_bias, out, *
     result = jnp.broadcast_to(third_bias[...][None, :], (rows, third.shape[1]))
     for start, length in tiles(second.shape[1], CHANNELS):
         hidden = _second(inner, second, second_bias, start, length)
-        result += _product(hidden, third[pl.ds(start, length), :])
+        result += pallas.product(hidden, third[pl.ds(start, length), :])
     columns = jnp.arange(third.shape[1])
     plgpu.store(out.at[at[:, None], columns[None, :]], result.astype(out.dtype), mask=(at < len(x))[:, None])
 
@@ -189,14 +189,14 @@ def _gradient_of_last(
         pulled = plgpu.load(pull.at[at[:, None], columns[None, :]], mask=(at < len(x))[:, None], other=0.0)
         inner = [_turned_hidden(table, first, first_bias, second.dtype, k, width) for k, width in parts]
         kernels = [second[pl.ds(k, width), pl.ds(start, channels)] for k, width in parts]
-        middle = functools.reduce(jnp.add, [_product(turned, part, (0, 0)) for turned, part in zip(kernels, inner, strict=True)])
+        middle = functools.reduce(jnp.add, [pallas.product(turned, part, along=0) for turned, part in zip(kernels, inner, strict=True)])
         middle = jnp.maximum(middle + second_bias[pl.ds(start, channels)][:, None], 0.0).astype(second.dtype)
-        change = jnp.where(middle > 0, _product(third[pl.ds(start, channels), :], pulled, (1, 1)), 0.0)
+        change = jnp.where(middle > 0, pallas.product(third[pl.ds(start, channels), :], pulled, over=1), 0.0)
         bias += jnp.sum(change, axis=1)
         change = change.astype(second.dtype)
         plgpu.store(steep.at[mine[:, None], at[None, :]], change, mask=(at < len(x))[None, :])
-        wide = [total + _product(change, part, (1, 1)) for total, part in zip(wide, inner, strict=True)]
-        return wide, bias, last + _product(middle, pulled)
+        wide = [total + pallas.product(change, part, over=1) for total, part in zip(wide, inner, strict=True)]
+        return wide, bias, last + pallas.product(middle, pulled)
 
     zeros = lambda *shape: jnp.zeros(shape, jnp.float32)  # noqa: E731
     begin = [zeros(channels, width) for _, width in parts], zeros(channels), zeros(channels, outputs)
@@ -217,9 +217,9 @@ def _gradient_of_first(x, steep, first, first_bias, second, of_first, *, rows: i
         for k, width in parts:
             columns = k + jnp.arange(width)
             change = plgpu.load(steep.at[columns[:, None], at[None, :]], mask=(at < len(x))[None, :], other=0.0)
-            back.append(_product(second[pl.ds(start, channels), pl.ds(k, width)], change))
+            back.append(pallas.product(second[pl.ds(start, channels), pl.ds(k, width)], change))
         inner = _turned_hidden(table, first, first_bias, second.dtype, start, channels)
-        return total + _product(jnp.where(inner > 0, functools.reduce(jnp.add, back), 0.0), table)
+        return total + pallas.product(jnp.where(inner > 0, functools.reduce(jnp.add, back), 0.0), table)
 
     begin = jnp.zeros(of_first.shape, jnp.float32)
     of_first[...] = jax.lax.fori_loop(0, pl.cdiv(pl.cdiv(len(x), rows) - program, programs), add, begin)
@@ -241,7 +241,7 @@ def _load_rows(x, at: Array, *, one: bool = False) -> Array:
 def _hidden(table: Array, first, bias, dtype) -> list[Array]:
     """Tiles of the first layer's values behind ReLU."""
     values = [
-        _product(table, _load_first(first, start, length)) + bias[pl.ds(start, length)][None, :]
+        pallas.product(table, _load_first(first, start, length)) + bias[pl.ds(start, length)][None, :]
         for start, length in tiles(first.shape[1], CHANNELS)
     ]
     return [jnp.maximum(part, 0.0).astype(dtype) for part in values]
@@ -249,7 +249,7 @@ def _hidden(table: Array, first, bias, dtype) -> list[Array]:
 
 def _turned_hidden(table: Array, first, bias, dtype, start, length: int) -> Array:
     """The first layer's values behind ReLU, channels by rows, for some of its channels."""
-    values = _product(_load_first(first, start, length), table, (0, 1)) + bias[pl.ds(start, length)][:, None]
+    values = pallas.product(_load_first(first, start, length), table, along=0, over=1) + bias[pl.ds(start, length)][:, None]
     return jnp.maximum(values, 0.0).astype(dtype)
 
 
@@ -262,10 +262,5 @@ def _load_first(first, start, length: int) -> Array:
 def _second(inner: list[Array], second, bias, start, length: int) -> Array:
     """The second layer's values behind ReLU, for some of its channels."""
     parts = tiles(second.shape[0], CHANNELS)
-    values = [_product(part, second[pl.ds(k, width), pl.ds(start, length)]) for part, (k, width) in zip(inner, parts, strict=True)]
+    values = [pallas.product(part, second[pl.ds(k, width), pl.ds(start, length)]) for part, (k, width) in zip(inner, parts, strict=True)]
     return jnp.maximum(functools.reduce(jnp.add, values) + bias[pl.ds(start, length)][None, :], 0.0).astype(second.dtype)
-
-
-def _product(a: Array, b: Array, along: tuple[int, int] = (1, 0)) -> Array:
-    """Multiplies matrices on the matrix units, over an axis of each; sums are float32."""
-    return jax.lax.dot_general(a, b, (((along[0],), (along[1],)), ((), ())), preferred_element_type=jnp.float32)

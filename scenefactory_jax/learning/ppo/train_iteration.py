@@ -215,7 +215,7 @@ def make_trainer(env: Env, policy: Policy, config: PPOConfig, *, episode_steps: 
             devices learns the same, up to rounding.
     """
     ppo, shards = make_constants(env, policy, config, mesh)
-    starts = episode_steps // env.action_repeat if config.stagger_episodes else 1
+    starts = trainer.count_starts(env, episode_steps, staggered=config.stagger_episodes)
     iterate = functools.partial(train_iteration, ppo)
     return trainer.compile_trainer(functools.partial(init, ppo, shards, starts), iterate, env, starts=starts, mesh=mesh)
 
