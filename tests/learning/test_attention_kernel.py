@@ -134,7 +134,7 @@ def test_a_gpu_gets_kernels_and_other_devices_plain_jax(dtype):
 def test_gpus_that_kernels_were_not_measured_on_get_plain_jax(capability, made, monkeypatch):
     """With less shared memory a kernel may not start: attention, residual part and embedding ask the same question."""
     monkeypatch.setattr(jax, "local_devices", lambda *, backend: [types.SimpleNamespace(compute_capability=capability)])
-    numbers = attention.Transformer((64, 64, 32), heads=2, head_features=16, feed_forward=2, kernels=True)
+    numbers = attention.Transformer((64, 64, 32), heads=2, head_features=16, feed_forward=2, residual_init=0.0, kernels=True)
     [features] = draw(0, (4, 5, 1, 7))
     blocks = {"others": Block(features, jnp.ones(features.shape[:3], bool))}
     one = encoder_modules.LatentQuery(lambda _: blocks, numbers, "bfloat16", latents=16, width=32, rounds=1)

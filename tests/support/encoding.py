@@ -7,7 +7,7 @@ import numpy as np
 from scenefactory_jax.core.types import SetObservation
 from scenefactory_jax.learning.networks import heads
 
-SMALL = {"embedding": [8, 6], "heads": 2, "head_features": 4, "feed_forward": 2, "kernels": True}
+SMALL = {"embedding": [8, 6], "heads": 2, "head_features": 4, "feed_forward": 2, "residual_init": 0.0, "kernels": True}
 LATENTS = {"transformer": SMALL, "latents": 3, "width": 10}
 ENTRIES = {
     "none": {},

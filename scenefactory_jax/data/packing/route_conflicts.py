@@ -28,6 +28,13 @@ class Zone(NamedTuple):
     match: tuple[float, float]  # one place in the zone; inf: the routes cross
 
 
+class Line(NamedTuple):
+    """A route up to its end, sampled every ROUTE_SPACING_M."""
+
+    points: Float[np.ndarray, "N 2"]
+    directions: Float[np.ndarray, "N 2"]  # of length 1
+
+
 def find_zones(leaves: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
     """Computes `zone_enter`, `zone_leave` and `zone_match` of a scene's traffic from its columns."""
     has_route, size = leaves["traffic_log.has_route"], leaves["traffic_log.size"]
@@ -46,43 +53,44 @@ def make_no_zones(traffic: int) -> dict[str, np.ndarray]:
     return {f"traffic_log.{name}": np.zeros((traffic, traffic, 0)) for name in NAMES}
 
 
-def find_pair_zones(line: Float[np.ndarray, "N 2"], other: Float[np.ndarray, "M 2"], reach_m: float) -> list[Zone]:
-    """Finds the zones of two routes that are sampled every ROUTE_SPACING_M, in the order in which they are reached."""
-    if len(line) < 2 or len(other) < 2 or not _may_touch(line, other, reach_m):
+def find_pair_zones(line: Line, other: Line, reach_m: float) -> list[Zone]:
+    """Finds the zones of two routes in the order in which they are reached."""
+    if len(line.points) < 2 or len(other.points) < 2:
         return []
-    squared = ((line[:, None] - other[None]) ** 2).sum(axis=2)
+    (start, stop), (other_start, other_stop) = _find_part(line, other, reach_m), _find_part(other, line, reach_m)
+    part, other_part = line.points[start:stop], other.points[other_start:other_stop]
+    squared = (part[:, None, 0] - other_part[None, :, 0]) ** 2 + (part[:, None, 1] - other_part[None, :, 1]) ** 2
     near = squared < reach_m**2
-    directions, other_directions = _find_directions(line), _find_directions(other)
     zones = []
     for begin, end in _find_runs(near.any(axis=1)):
         rows, columns = np.nonzero(near[begin:end])
         for low, high in _find_runs(near[begin:end].any(axis=0)):
             inside = (columns >= low) & (columns < high)
-            places, others = begin + rows[inside], columns[inside]
-            same_way = float((directions[places] * other_directions[others]).sum(axis=1).mean()) > SAME_WAY_COSINE
-            nearest = int(np.argmin(squared[places, others]))
+            rows_inside, columns_inside = begin + rows[inside], columns[inside]
+            nearest = int(np.argmin(squared[rows_inside, columns_inside]))
+            places, others = start + rows_inside, other_start + columns_inside
+            same_way = float((line.directions[places] * other.directions[others]).sum(axis=1).mean()) > SAME_WAY_COSINE
             match = (float(places[nearest]), float(others[nearest])) if same_way else (np.inf, np.inf)
             enter, leave = (float(places.min()), float(others.min())), (float(places.max()), float(others.max()))
             zones.append(Zone(*((ROUTE_SPACING_M * a, ROUTE_SPACING_M * b) for a, b in (enter, leave, match))))
     return sorted(zones, key=lambda zone: sum(zone.enter))
 
 
-def _read_line(leaves: Mapping[str, np.ndarray], row: int) -> Float[np.ndarray, "N 2"]:
+def _read_line(leaves: Mapping[str, np.ndarray], row: int) -> Line:
     """The points of a vehicle's route up to its end."""
     route = leaves["traffic_log.route"][row]
-    points = int(np.ceil(leaves["routes.length"][route] / ROUTE_SPACING_M)) + 1
-    return leaves["routes.position"][route, :points]
+    points = leaves["routes.position"][route, : int(np.ceil(leaves["routes.length"][route] / ROUTE_SPACING_M)) + 1]
+    if len(points) < 2:  # no direction, no zones
+        return Line(points, points)
+    along = np.gradient(points, axis=0)
+    return Line(points, along / np.maximum(np.linalg.norm(along, axis=1, keepdims=True), 1e-9))
 
 
-def _may_touch(line: Float[np.ndarray, "N 2"], other: Float[np.ndarray, "M 2"], reach_m: float) -> bool:
-    """Whether the boxes around two lines are within reach."""
-    return bool(np.all(line.min(axis=0) - reach_m <= other.max(axis=0)) and np.all(other.min(axis=0) - reach_m <= line.max(axis=0)))
-
-
-def _find_directions(line: Float[np.ndarray, "N 2"]) -> Float[np.ndarray, "N 2"]:
-    """Unit directions at the points of a line."""
-    along = np.gradient(line, axis=0)
-    return along / np.maximum(np.linalg.norm(along, axis=1, keepdims=True), 1e-9)
+def _find_part(line: Line, other: Line, reach_m: float) -> tuple[int, int]:
+    """First and last index (exclusive) of the points of a line that are within reach of the box around another line; (0, 0): none."""
+    low, high = other.points.min(axis=0) - reach_m, other.points.max(axis=0) + reach_m
+    rows = np.flatnonzero(((line.points >= low) & (line.points <= high)).all(axis=1))
+    return (int(rows[0]), int(rows[-1]) + 1) if len(rows) else (0, 0)
 
 
 def _find_runs(mask: Bool[np.ndarray, " N"]) -> list[tuple[int, int]]:

@@ -35,6 +35,7 @@ class Transformer:
     heads: Count
     head_features: Count
     feed_forward: Count  # hidden width of a feed-forward part, in widths of its input
+    residual_init: float  # the learnt numbers of ReZero at first
     kernels: bool  # Triton kernels on an H100 or H200, where they fit
 
     def __post_init__(self) -> None:

@@ -1,7 +1,7 @@
 """Modules of the encoders: observation -> feature. `encoders` has their config entries.
 
 ReZero (arXiv:2003.04887) in place of normalisation: each attention and each feed-forward part adds its output times a learnt number, which
-is 0 at first.
+is `residual_init` at first (0 in the paper).
 """
 
 import flax.linen as nn
@@ -107,7 +107,7 @@ class LatentEncoder(BlockEncoder):
             keys_values: that the attention is to; the queries' own by default.
         """
         attention, forward = parts
-        scale = self.param(f"rezero_{name}", nn.initializers.zeros, ())
+        scale = self.param(f"rezero_{name}", nn.initializers.constant(self.numbers.residual_init), ())
         found = attention(x, attention.project(x) if keys_values is None else keys_values, mask)
         if forward is None:
             return x + scale * residual.affine(self.dtype, attention.out(), found).astype(jnp.float32)
