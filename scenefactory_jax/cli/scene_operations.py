@@ -19,6 +19,7 @@ from scenefactory_jax.data.bank import catalogue
 from scenefactory_jax.data.bank.bank_reader import Bank
 from scenefactory_jax.data.curation import ego_choice, operations
 from scenefactory_jax.data.curation.features import COLUMNS
+from scenefactory_jax.data.curation.mirroring import mirror
 from scenefactory_jax.data.export import gpudrive, scenarionet
 from scenefactory_jax.data.loading import scene_source
 
@@ -91,12 +92,18 @@ def split(config: Mapping[str, Any]) -> dict[str, Bank]:
 def egos(config: Mapping[str, Any]) -> Bank:
     """Writes the bank `out` of the scenes, and of the scenes with other cars in the recording car's place; split by streets before it."""
     bank, out, settings = _open(_get_path(config)), require_out(config, "the bank"), config["egos"]
-    chosen = (scene for raw in banks.read_raws(bank, range(len(bank))) for scene in ego_choice.choose_egos(raw, **settings))
+    chosen = _choose_egos(bank, **settings)
     features = instantiate(config["features"], builtins="scenefactory_jax.data.curation.features", where="features")
     account = {"op": "egos", "scenes": len(bank), **settings}
     written = banks.write(out, chosen, settings={"made_by": account, "of": dict(bank.settings)}, features=features)
     print(f"{out}: {len(written)} scenes from {len(bank)}", flush=True)
     return written
+
+
+def _choose_egos(bank: Bank, *, mirrored: bool, **settings: Any) -> Iterator[RawScene]:
+    for raw in banks.read_raws(bank, range(len(bank))):
+        for scene in ego_choice.choose_egos(raw, **settings):
+            yield from (scene, mirror(scene)) if mirrored else (scene,)
 
 
 def export(config: Mapping[str, Any]) -> int:

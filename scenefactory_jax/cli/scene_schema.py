@@ -141,6 +141,7 @@ class Egos:
     count: Count | None
     min_travel_m: Annotated[float, Bounds(min=0.0)]
     keep_recording_car: bool
+    mirrored: bool
 
 
 @dataclass(frozen=True)
