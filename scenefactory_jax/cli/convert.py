@@ -1,4 +1,4 @@
-"""`convert`: scene files in any known format -> a bank, with an account of what was kept, dropped and refused."""
+"""`convert`: scene files in any known format, or generated scenes -> a bank, with an account of what was kept, dropped and refused."""
 
 import functools
 from collections.abc import Mapping
@@ -28,11 +28,12 @@ def convert(config: Mapping[str, Any]) -> Summary:
         SceneError: no files, `out` is something else than a bank or a bank made with other settings, or not one usable scene.
     """
     schema.check(config, Convert)
-    for key in ("source", "out"):
-        if config[key] is None:
-            raise ConfigError(f"{key}: missing; `convert source=FILE_OR_FOLDER out=BANK`")
     scenes = config["scenes"]
-    settings = {key: scenes[key] for key in ("formats", "check", "pack")}
+    generates = config["source"] is None and "_target_" in (scenes["generate"] or {})
+    for key in ("out",) if generates else ("source", "out"):
+        if config[key] is None:
+            raise ConfigError(f"{key}: missing; `convert source=FILE_OR_FOLDER out=BANK`, or `convert scenes=town out=BANK`")
+    settings = {key: scenes[key] for key in ("generate" if generates else "formats", "check", "pack")}
     settings |= {key: config[key] for key in ("features", "bank", "quality", "lanes")}
     rules = quality_gate.make(config["quality"])
     rebuild = instantiate(config["lanes"]["topology"], builtins="scenefactory_jax.roadgraph.lane_topology", where="lanes.topology")
@@ -45,10 +46,13 @@ def convert(config: Mapping[str, Any]) -> Summary:
         refine=functools.partial(conversion.complete, check=packing["check"], rebuild=rebuild, gate=gate),
         features=None if features is None else instantiate(features, builtins="scenefactory_jax.data.bank.catalogue", where="features"),
     )
+    source = config["source"]
+    if generates:
+        source = conversion.Generated(scene_source.make_generator(scenes), scenes["seed"], scenes["count"])
     with Progress(disable=not config["progress"]) as bar:
         task = bar.add_task("convert")
         summary = conversion.convert(
-            config["source"], config["out"], tools=tools, settings=settings,
+            source, config["out"], tools=tools, settings=settings,
             spread=instantiate(config["spread"], builtins="scenefactory_jax.core.parallel.task_map", where="spread"),
             on_file=lambda done, total: bar.update(task, completed=done, total=total), **config["bank"],
         )  # fmt: skip

@@ -1,4 +1,4 @@
-"""Files in any known format -> a bank. Files and scenes that cannot be used are listed with their reasons.
+"""Files in any known format, or scenes of a generator -> a bank. Files and scenes that cannot be used are listed with their reasons.
 
 Scenes go into the bank uncut. They are also packed on trial: the counts of what packing keeps and drops are stored, and a scene that it
 refuses stays in the bank with the reason in its row, because other numbers may accept it. Scenes that the checks refuse are left out.
@@ -8,7 +8,7 @@ import functools
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from scenefactory_jax.core import folder_lock
 from scenefactory_jax.core.instantiate import ConfigError
@@ -18,7 +18,7 @@ from scenefactory_jax.data.bank import arrow_codec, bank_index, bank_reader, ban
 from scenefactory_jax.data.bank.bank_index import Index
 from scenefactory_jax.data.bank.bank_writer import Compression, SourceFileResult
 from scenefactory_jax.data.formats import reader_selection
-from scenefactory_jax.data.loading.scene_source import Check, Pack, explain, read_file
+from scenefactory_jax.data.loading.scene_source import Check, Pack, Read, explain, open_generator, read_file
 from scenefactory_jax.data.packing.pack import PackReport, prepare
 from scenefactory_jax.data.packing.summary import Summary, count_results, list_entries, summarise
 
@@ -34,8 +34,24 @@ class SceneTools:
     features: catalogue.Features | None = None  # further columns of the catalogue
 
 
+class Generated(NamedTuple):
+    """The first scenes of a generator."""
+
+    generate: Callable[[int, int], RawScene]  # (seed, index) -> scene
+    seed: int
+    count: int
+
+
+class Entry(NamedTuple):
+    """What a conversion reads at once: a file, or one scene of a generator."""
+
+    name: str  # in the bank
+    source: str  # in messages
+    read: Read
+
+
 def convert(
-    path: Path | str,
+    source: Path | str | Generated,
     out: Path | str,
     *,
     tools: SceneTools,
@@ -45,48 +61,62 @@ def convert(
     compression: Compression,
     on_file: Callable[[int, int], None] | None = None,
 ) -> Summary:
-    """Reads every file below `path` into the bank `out`. A stopped conversion continues; a complete one adds new files.
+    """Reads every file of a source, or every generated scene, into the bank `out`. A stopped conversion continues; a complete one adds new ones.
 
     Files that could not be read are read again.
 
     Args:
-        path, out: a file or a folder with its subfolders; the bank's folder.
+        source: a file, a folder with its subfolders, or a generator.
+        out: the bank's folder.
         settings: the config behind `tools`, stored in the bank; a bank with other settings is refused.
-        spread: task map over the files; order and result do not depend on it.
+        spread: task map over the entries; order and result do not depend on it.
         shard_scenes, compression: of the bank's files, see `bank_writer.append_files`.
-        on_file: called with (files done, files in all) after each file.
+        on_file: called with (entries done, entries in all) after each of them.
 
     Raises:
         SceneError: no files, `out` is not a bank or has other settings, or no usable scene, with the first reasons.
         ConfigError: a number that a part refuses.
         folder_lock.Busy: another command writes to `out`.
     """
-    root, out = Path(path).absolute(), Path(out).resolve()
-    files = reader_selection.find(root)
+    description, entries = _list_entries(source, tools.formats)
+    out = Path(out).resolve()
     bank_writer.check_target(out)
-    work = functools.partial(convert_file, root=root, out=out, tools=tools)
+    work = functools.partial(convert_entry, out=out, tools=tools)
 
-    def results(waiting: Sequence[Path]) -> Iterator[SourceFileResult]:
-        done = len(files) - len(waiting)
-        for number, (file, result) in enumerate(zip(waiting, spread(work, list(enumerate(waiting))), strict=True), start=done + 1):
+    def results(waiting: Sequence[Entry]) -> Iterator[SourceFileResult]:
+        done = len(entries) - len(waiting)
+        for number, (entry, result) in enumerate(zip(waiting, spread(work, list(enumerate(waiting))), strict=True), start=done + 1):
             if isinstance(result, FailedTask):
-                result = SourceFileResult(_name(file, root), **list_entries([Reject(None, result.reason, None, str(file))]))
+                result = SourceFileResult(entry.name, **list_entries([Reject(None, result.reason, None, entry.source)]))
             yield result
             if on_file is not None:
-                on_file(number, len(files))
+                on_file(number, len(entries))
 
     with folder_lock.lock_folder(out):
-        index = _begin(root, out, bank_index.plain({"source": str(root), **settings}))
+        index = _begin(entries, out, bank_index.plain({"source": description, **settings}))
         known = set(index.files)
-        waiting = [file for file in files if _name(file, root) not in known]
+        waiting = [entry for entry in entries if entry.name not in known]
         try:
             index = bank_writer.append_files(out, results(waiting), index=index, shard_scenes=shard_scenes, compression=compression)
         finally:
             bank_writer.remove_parts(out)
-    return summarise(index.account, files=len(index.files), rejects=index.rejects, companions=index.companions)
+    files = 0 if isinstance(source, Generated) else len(index.files)
+    return summarise(index.account, files=files, rejects=index.rejects, companions=index.companions)
 
 
-def _begin(root: Path, out: Path, settings: dict[str, Any]) -> Index:
+def _list_entries(source: Path | str | Generated, formats: Mapping[str, reader_selection.Reader]) -> tuple[Any, list[Entry]]:
+    """What the bank's settings say of a source, and what there is to read."""
+    if isinstance(source, Generated):
+        scenes = open_generator(source.generate, seed=source.seed)
+        numbers = range(source.count)
+        return scenes.description, [Entry(f"{source.seed}-{index}", scenes.name(index), scenes.reader(index)) for index in numbers]
+    root = Path(source).absolute()
+    name = lambda file: file.relative_to(root).as_posix() if file != root else file.name  # noqa: E731
+    files = reader_selection.find(root)
+    return str(root), [Entry(name(file), str(file), functools.partial(read_file, file, formats)) for file in files]
+
+
+def _begin(entries: Sequence[Entry], out: Path, settings: dict[str, Any]) -> Index:
     """The index of the bank in `out`, if it has these settings, without the files that gave no scene; else that of a new bank."""
     if not bank_index.is_bank(out):
         return Index(settings)
@@ -96,25 +126,21 @@ def _begin(root: Path, out: Path, settings: dict[str, Any]) -> Index:
     bank_writer.remove_parts(out)
     failed = {reject["source"] for reject in index.rejects if reject["scene"] is None}
     failed -= set(bank_reader.open(out).metadata["source"].to_pylist())
-    files = tuple(file for file in index.files if str(root / file if root.is_dir() else root) not in failed)
-    rejects = tuple(reject for reject in index.rejects if reject["source"] not in failed)
+    again = {entry.name: entry.source for entry in entries if entry.source in failed}
+    files = tuple(file for file in index.files if file not in again)
+    rejects = tuple(reject for reject in index.rejects if reject["source"] not in set(again.values()))
     return replace(index, files=files, rejects=rejects, complete=False)
 
 
-def _name(file: Path, root: Path) -> str:
-    """A source file's name in the bank."""
-    return file.relative_to(root).as_posix() if file != root else file.name
-
-
-def convert_file(item: tuple[int, Path], *, root: Path, out: Path, tools: SceneTools) -> SourceFileResult:
-    """Writes the scenes of one file to a part of the bank's folder. Any error is a reject, but for `ConfigError`."""
-    number, path = item
+def convert_entry(item: tuple[int, Entry], *, out: Path, tools: SceneTools) -> SourceFileResult:
+    """Writes the scenes of an entry to a part of the bank's folder. Any error is a reject, but for `ConfigError`."""
+    number, entry = item
     rows: list[dict[str, Any]] = []
     trials: list[PackReport | str] = []
     rejects: list[Reject] = []
 
     def batches() -> Iterator[Any]:
-        for raw in read_file(path, tools.formats):
+        for raw in _read(entry):
             if isinstance(raw, Reject):
                 rejects.append(raw)
                 continue
@@ -128,14 +154,23 @@ def convert_file(item: tuple[int, Path], *, root: Path, out: Path, tools: SceneT
             except ConfigError:
                 raise
             except Exception as error:
-                rejects.append(explain(error, str(path), raw.name))
+                rejects.append(explain(error, entry.source, raw.name))
                 continue
             trials.append(trial)
             rows.append(row | {"packing": trial if isinstance(trial, str) else catalogue.PACKED})
             yield batch
 
     part = bank_writer.write_part(out, number, batches())
-    return SourceFileResult(_name(path, root), part=part, rows=tuple(rows), **list_entries(rejects), account=count_results(trials))
+    return SourceFileResult(entry.name, part=part, rows=tuple(rows), **list_entries(rejects), account=count_results(trials))
+
+
+def _read(entry: Entry) -> Iterator[RawScene | Reject]:
+    try:
+        yield from entry.read()
+    except ConfigError:
+        raise
+    except Exception as error:  # of a generator; of a file it is a reject already
+        yield explain(error, entry.source)
 
 
 def complete(
