@@ -61,7 +61,7 @@ def convert(
     compression: Compression,
     on_file: Callable[[int, int], None] | None = None,
 ) -> Summary:
-    """Reads every file of a source, or every generated scene, into the bank `out`. A stopped conversion continues; a complete one adds new ones.
+    """Reads every file or generated scene into the bank `out`. A stopped conversion continues; a complete one adds new ones.
 
     Files that could not be read are read again.
 

@@ -59,12 +59,12 @@ def find_pair_zones(line: Line, other: Line, reach_m: float) -> list[Zone]:
         return []
     (start, stop), (other_start, other_stop) = _find_part(line, other, reach_m), _find_part(other, line, reach_m)
     part, other_part = line.points[start:stop], other.points[other_start:other_stop]
-    squared = (part[:, None, 0] - other_part[None, :, 0]) ** 2 + (part[:, None, 1] - other_part[None, :, 1]) ** 2
+    squared = np.square(part[:, None, 0] - other_part[None, :, 0]) + np.square(part[:, None, 1] - other_part[None, :, 1])
     near = squared < reach_m**2
     zones = []
-    for begin, end in _find_runs(near.any(axis=1)):
+    for begin, end in _find_runs(np.any(near, axis=1)):
         rows, columns = np.nonzero(near[begin:end])
-        for low, high in _find_runs(near[begin:end].any(axis=0)):
+        for low, high in _find_runs(np.any(near[begin:end], axis=0)):
             inside = (columns >= low) & (columns < high)
             rows_inside, columns_inside = begin + rows[inside], columns[inside]
             nearest = int(np.argmin(squared[rows_inside, columns_inside]))
