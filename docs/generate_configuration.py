@@ -21,7 +21,8 @@ from scenefactory_jax.env.environment import EnvConfig
 from scenefactory_jax.learning.ppo.config import PPOConfig
 
 SCHEMAS = {  # of commands; those of groups follow below
-    "train": commands.Train, "record": commands.Record, "evaluate": commands.Evaluate, "attack": attack.AttackConfig, "compare": commands.Compare,
+    "train": commands.Train, "record": commands.Record, "evaluate": commands.Evaluate, "attack": attack.AttackConfig,
+    "compare": commands.Compare,
     "export": commands.Export, "convert": scene_schema.Convert, "scenes": scene_schema.SceneOperations, "view": view.View,
     "benchmark": commands.Benchmark, "study": commands.Study, "sysid": commands.Sysid, "physics": commands.Physics,
 }  # fmt: skip

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 from scenefactory_jax.cli import evaluate as evaluation
@@ -19,7 +20,8 @@ from scenefactory_jax.core.trajectory import TrafficBoxes
 from scenefactory_jax.data.bank import bank_reader, bank_writer
 from scenefactory_jax.data.loading import scene_source
 from scenefactory_jax.env.environment import episode_steps
-from scenefactory_jax.evaluation.adversary import adversarial_scenes, attack as attacks
+from scenefactory_jax.evaluation.adversary import adversarial_scenes
+from scenefactory_jax.evaluation.adversary import attack as attacks
 from scenefactory_jax.evaluation.adversary.ego_drive import EGO, make_drive
 from scenefactory_jax.evaluation.adversary.kinematics import Track
 from scenefactory_jax.evaluation.adversary.settings import AttackSettings
@@ -77,7 +79,7 @@ def attack(config: Mapping[str, Any]) -> Attacked:
     out, folder = _find_folders(config)
     settings = schema.read({name: config[name] for name in PARTS}, AttackSettings)
     scene_source.use_compilation_cache()
-    tasks = _Tasks(config)
+    tasks = Tasks(config)
     name = config["planner"] or str(config["run"])
     ego, parameters = tasks.make_ego()
     steps = round(episode_steps(ego["timing"]) / float(ego["timing"]["control_hz"]) / STEP_S)
@@ -112,7 +114,7 @@ def _find_folders(config: Mapping[str, Any]) -> tuple[Path, Path]:
     return out, out.with_name(f"{out.name}-report")
 
 
-class _Tasks:
+class Tasks:
     """Configs of environments with the planners that drive in them."""
 
     def __init__(self, config: Mapping[str, Any]):
@@ -147,10 +149,10 @@ class _Tasks:
 
 
 def _replay(
-    tasks: _Tasks, scenes: scene_source.Scenes, result: attacks.Result, rows: list[dict[str, Any]], settings: AttackSettings, steps: int
+    tasks: Tasks, scenes: scene_source.Scenes, result: attacks.Result, rows: list[dict[str, Any]], settings: AttackSettings, steps: int
 ) -> np.ndarray:
     """Whether articulated cars and the C engine reproduce the contact of each world; adds the columns to the table."""
-    hit = np.flatnonzero(result.attack.outcome.success)
+    hit = np.flatnonzero(attacks.find_hits(result))
     touched = np.zeros(len(rows), bool)
     if not len(hit):
         return touched
@@ -172,7 +174,7 @@ def _take_pairs(scenes: scene_source.Scenes, result: attacks.Result, hit: np.nda
     attack = result.attack
     slot = np.argmax(attack.chosen.row[hit] == attack.outcome.contact.row[hit][:, None], axis=1)
     columns = zip(attack.drive.ego, attack.track, strict=True)
-    pairs = Track(*(np.stack([ego[hit], adversaries[hit, slot]], axis=1) for ego, adversaries in columns))
+    pairs = Track(*(jnp.stack([ego[hit], adversaries[hit, slot]], axis=1) for ego, adversaries in columns))
     return pairs, np.stack([np.asarray(scenes.scene.agents.size)[hit, EGO], attack.chosen.size[hit, slot]], axis=1)
 
 

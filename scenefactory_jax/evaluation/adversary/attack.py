@@ -27,6 +27,7 @@ VERDICTS = {  # by precedence
     "hits_another": "the ego's first contact is with another road user",
     "off_road": "an adversary leaves the road",
     "overlaps": "an adversary overlaps another road user",
+    "graze": "ego and adversary overlap too little",
     "unsolvable": "no ego avoids the collision",
     "no_contact_of_cars": "articulated cars do not touch where the bicycles do",
     KEPT: "an adversarial scene",
@@ -108,6 +109,11 @@ class _Blocks:
         return jax.tree.map(lambda *leaves: np.concatenate(leaves)[:count], *results)
 
 
+def find_hits(result: Result) -> Bool[np.ndarray, " W"]:
+    """Finds the worlds in which the attack succeeded, and the ego does not collide without it."""
+    return np.asarray(result.attack.outcome.success & ~result.attack.plain.found)
+
+
 def judge_worlds(result: Result, touched: Bool[np.ndarray, " W"] | None) -> list[str]:
     """Says of each world whether it is kept, or the first of VERDICTS for which it is dropped.
 
@@ -123,6 +129,7 @@ def judge_worlds(result: Result, touched: Bool[np.ndarray, " W"] | None) -> list
         "hits_another": ~outcome.hit,
         "off_road": outcome.off_road,
         "overlaps": outcome.overlaps,
+        "graze": ~outcome.deep,
         "unsolvable": ~solved,
         "no_contact_of_cars": np.zeros_like(solved) if touched is None else ~touched,
     }
@@ -133,9 +140,9 @@ def make_table(result: Result, scene: Scene, names: tuple[str, ...], verdicts: l
     """Lists a row for every world."""
     attack, contact = result.attack, result.attack.outcome.contact
     off_road, logged_off_road = (np.asarray(part) for part in _find_off_road(scene, attack))
-    rows = []
+    hits, rows = find_hits(result), []
     for world, name in enumerate(names):
-        hit = bool(attack.outcome.success[world])
+        hit = bool(hits[world])
         rows.append({
             "scene": name,
             "verdict": verdicts[world],

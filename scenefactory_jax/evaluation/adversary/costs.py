@@ -1,7 +1,8 @@
 """Costs of adversarial driving: the distance to the ego, the distances among the traffic, the way off the road, changes of the actions.
 
-Bodies are covered by three circles each (`geometry.cover_with_circles`); a clearance is the smallest distance between circles of two bodies,
-negative where they overlap. Terms follow KING (arXiv:2204.13683) and ReGentS (arXiv:2409.07830); `docs/adversaries.md` has the equations.
+Bodies are covered by three circles each (`geometry.cover_with_circles`); a clearance is the smallest distance between circles of two
+bodies, negative where they overlap. Terms follow KING (arXiv:2204.13683) and ReGentS (arXiv:2409.07830); `docs/adversaries.md` has the
+equations.
 """
 
 from typing import NamedTuple
@@ -86,8 +87,8 @@ def compute_outside(
 ) -> Float[Array, "*n 4"]:
     """Computes how far the corners of cars are off the road, m, negative on it.
 
-    A corner is off the road to the right of the nearest edge and farther than `half_lane_m` from all driving lanes: edges that a map has the
-    wrong way round, or that cross a driveway, do not put a lane off the road. The gradient leads back over the nearer of the two.
+    A corner is off the road to the right of the nearest edge and farther than `half_lane_m` from all driving lanes: edges that a map has
+    the wrong way round, or that cross a driveway, do not put a lane off the road. The gradient leads back over the nearer of the two.
     """
     corners = compute_corners(position, yaw, jnp.broadcast_to(size, position.shape))
     distance, side = measure_segments(corners, road.edges)

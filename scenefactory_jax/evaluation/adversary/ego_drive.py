@@ -116,7 +116,9 @@ def find_off_road(scene: Scene, position: Float[Array, "T 2"], yaw: Float[Array,
     return jax.vmap(lambda place, turn: jnp.any(waymax_steps.compute_edge_distances(place, turn, size, edges) > 0))(position, yaw)
 
 
-def insert_tracks(scene: Scene, row: Int[Array, " K"], use: Bool[Array, " K"], track: Track, present: Bool[Array, "K T"], *, start_row: int):
+def insert_tracks(
+    scene: Scene, row: Int[Array, " K"], use: Bool[Array, " K"], track: Track, present: Bool[Array, "K T"], *, start_row: int
+) -> Scene:
     """Puts tracks into the traffic's log from the start on; slots not in use keep their log."""
     log, steps = scene.traffic_log, track.yaw.shape[1]
     target = jnp.where(use, row, len(log.kind))  # beyond the end: dropped

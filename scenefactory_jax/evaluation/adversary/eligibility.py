@@ -34,7 +34,9 @@ class Adversaries(NamedTuple):
 def choose_adversaries(
     scene: Scene, settings: AttackSettings, *, start_row: int, steps: int
 ) -> tuple[Adversaries, dict[str, Bool[Array, " O"]]]:
-    """Chooses up to `count` vehicles of the traffic by their places beside the recorded ego, and says of the others why not (REASONS; a road user may have several).
+    """Chooses up to `count` vehicles of the traffic by their places beside the recorded ego.
+
+    Of the others it says why not: REASONS, of which a road user may have several.
 
     Args:
         start_row: row of the log at which the episode begins.

@@ -1,5 +1,6 @@
 """The attack as one program: actions of adversaries, optimised by Adam through the kinematics, against an ego that is simulated again."""
 
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
@@ -24,9 +25,10 @@ class Outcome(NamedTuple):
 
     contact: Contact
     hit: Bool[Array, ""]  # the first contact is with an adversary
+    deep: Bool[Array, ""]  # the ego and an adversary overlap by `contact_depth_m` at some time
     off_road: Bool[Array, ""]  # an adversary is off the road, farther than its log
     overlaps: Bool[Array, ""]  # an adversary overlaps another road user, which its log does not
-    success: Bool[Array, ""]  # hit, and neither of the others
+    success: Bool[Array, ""]  # hit, deep, and neither of the others
 
 
 class Attack(NamedTuple):
@@ -60,8 +62,8 @@ def attack_world(
 ) -> Attack:
     """Attacks the ego of one world.
 
-    In each round Adam improves the actions against the ego's last drive; then the ego is simulated among the adversaries, without a gradient.
-    The first round with a success ends the search of the world. A round before all others leaves the traffic as it is logged.
+    In each round Adam improves the actions against the ego's last drive; then the ego is simulated among the adversaries, without a
+    gradient. The first round with a success ends the search of the world. A round before all others leaves the traffic as it is logged.
 
     Args:
         drive: the ego's.
@@ -74,8 +76,8 @@ def attack_world(
     problem, dt, ego_size = make_logged_problem(scene, chosen, settings, start_row=start_row), scene.log.dt, scene.agents.size[EGO]
     optimizer = make_optimizer(settings, chosen.steers & chosen.eligible)
     change = jnp.zeros_like(chosen.actions)
-    seen: Drive = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), jax.eval_shape(drive, parameters, scene, key))
-    blank = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), jax.eval_shape(lambda: judge(scene, seen, chosen.followed, problem, settings)))
+    seen: Drive = _make_zeros(drive, parameters, scene, key)
+    blank: Outcome = _make_zeros(judge, scene, seen, chosen.followed, problem, settings)
     begun = (change, optimizer.init(change), seen, blank, blank.contact, jnp.int32(0))
 
     def run_round(carry: tuple, number: Int[Array, ""]) -> tuple[tuple, None]:
@@ -97,18 +99,29 @@ def attack_world(
     return Attack(chosen, reasons, plain, move(change, problem, settings, dt), driven, outcome, rounds)
 
 
+def _make_zeros(function: Callable[..., Any], *arguments: Any) -> Any:
+    """Zeros of the shapes that a function gives."""
+    return jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), jax.eval_shape(lambda: function(*arguments)))
+
+
 def make_optimizer(settings: AttackSettings, steers: Bool[Array, " K"]) -> optax.GradientTransformation:
     """Makes Adam, whose steps of curvatures are shorter, and zero for cars that must not steer."""
     search = settings.search
     factor = jnp.stack([jnp.ones(steers.shape), search.steering * steers], axis=-1)[:, None]
     return optax.chain(
         optax.adam(search.learning_rate, b1=search.beta1, b2=search.beta2, eps=search.epsilon),
-        optax.stateless(lambda updates, _: updates * factor),
+        optax.stateless(lambda updates, _: jax.tree.map(lambda step: step * factor, updates)),
     )
 
 
 def descend(
-    loss: Any, change: Float[Array, "K M 2"], memory: Any, optimizer: optax.GradientTransformation, *, iterations: int, settings: AttackSettings
+    loss: Callable[[Array], Array],
+    change: Float[Array, "K M 2"],
+    memory: Any,
+    optimizer: optax.GradientTransformation,
+    *,
+    iterations: int,
+    settings: AttackSettings,
 ) -> tuple[Float[Array, "K M 2"], Any]:
     """Runs Adam on changes of actions, which stay within `largest_change`."""
     most = settings.search.largest_change
@@ -116,7 +129,7 @@ def descend(
     def iterate(carry: tuple, _: None) -> tuple[tuple, None]:
         change, memory = carry
         updates, memory = optimizer.update(jax.grad(loss)(change), memory)
-        return (jnp.clip(optax.apply_updates(change, updates), -most, most), memory), None
+        return (jnp.clip(jnp.asarray(optax.apply_updates(change, updates)), -most, most), memory), None
 
     return jax.lax.scan(iterate, (change, memory), None, length=iterations)[0]
 
@@ -210,8 +223,11 @@ def judge(scene: Scene, driven: Drive, track: Track, problem: Problem, settings:
     beyond = jnp.max(outside, axis=-1) > problem.allowed[:, None] + OFF_ROAD_M
     off_road = jnp.any(beyond & there)
     overlaps = jnp.any(find_overlapping(track, driven.traffic, problem) & ~find_overlapping(chosen.followed, driven.traffic, problem))
-    success = hit & ~off_road & ~overlaps
-    return Outcome(contact, hit, off_road, overlaps, success)
+    smaller = scene.agents.size[EGO] - 2.0 * settings.search.contact_depth_m
+    deep = find_overlaps(driven.ego.position, driven.ego.yaw, smaller, track.position, track.yaw, chosen.size[:, None])
+    deep = jnp.any(deep & there)
+    success = hit & deep & ~off_road & ~overlaps
+    return Outcome(contact, hit, deep, off_road, overlaps, success)
 
 
 def find_overlapping(track: Track, traffic: Boxes, problem: Problem) -> Bool[Array, "K J"]:

@@ -58,6 +58,7 @@ class Search:
 
     rounds: Count
     iterations: Count  # of a round
+    contact_depth_m: NonNegative
     learning_rate: Positive
     beta1: Fraction
     beta2: Fraction

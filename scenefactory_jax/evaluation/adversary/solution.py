@@ -41,8 +41,8 @@ def solve_by_planner(
 def solve_by_gradient(scene: Scene, attack: Attack, settings: AttackSettings) -> Solution:
     """Optimises the actions of the ego's drive among the adversaries by the costs of `search.compute_upkeep`.
 
-    Solved: it touches nothing and stays on the road, as far as its drive did. The ego knows what will happen; so this says that a way exists,
-    not that a driver would find it.
+    Solved: it touches nothing and stays on the road, as far as its drive did. The ego knows what will happen; so this says that a way
+    exists, not that a driver would find it.
     """
     solution, dt = settings.solution, scene.log.dt
     weights = dataclasses.replace(settings.costs, repulsion=solution.repulsion)

@@ -50,8 +50,8 @@ def attack_figure(world: AttackedWorld) -> Figure:
         for track, size, colour in ((world.ego, world.ego_size, EGO), (world.adversary, world.adversary_size, ADVERSARY)):
             axes.plot(*track.position[: step + 1].T, color=rgb(colour), linewidth=1.8, zorder=3.2)
             axes.plot(*track.position[step:].T, color=rgb(colour), linewidth=1.0, linestyle=(0, (3, 2)), zorder=3.1)
-            figures.draw_car(axes, track.position[0], float(track.yaw[0]), size, colour, hollow=True)
-            figures.draw_car(axes, track.position[step], float(track.yaw[step]), size, colour)
+            figures.draw_car(axes, np.asarray(track.position[0]), float(track.yaw[0]), size, colour, hollow=True)
+            figures.draw_car(axes, np.asarray(track.position[step]), float(track.yaw[step]), size, colour)
     names = ((EGO, "ego"), (ADVERSARY, "adversary"), (LOGGED, "the adversary's log"))
     handles = [Line2D([], [], color=rgb(colour), linewidth=1.8, label=label) for colour, label in names]
     figure.legend(handles=handles, loc="outside lower center", ncols=len(handles), fontsize=7.5)

@@ -1,7 +1,7 @@
 """Replays two trajectories that collide with articulated cars, then with the same controls in MuJoCo's C engine: does the contact happen?
 
-Both cars follow their trajectories by the planner `expert` in the articulated car; the C engine drives the exported world (`exported_world`)
-with the controls of that replay, without feedback.
+Both cars follow their trajectories by the planner `expert` in the articulated car; the C engine drives the exported world
+(`exported_world`) with the controls of that replay, without feedback.
 """
 
 import tempfile
@@ -14,6 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from scenefactory_jax.core.geometry import dot, heading_vector
 from scenefactory_jax.core.pytree import replace
 from scenefactory_jax.core.types import AgentLog, Agents, Scene
 from scenefactory_jax.dynamics import mujoco_car
@@ -55,21 +56,21 @@ def replay_pairs(settings: Mapping[str, Any], scene: Scene, tracks: Track, size:
 
 def make_pairs(scene: Scene, tracks: Track, size: Float[np.ndarray, "N 2 2"]) -> Scene:
     """Makes worlds of two agents that start as their trajectories do and have these as logs; the rest of the scene stays."""
-    zero = np.zeros(tracks.yaw.shape[:2], np.float32)
-    start = tracks.velocity[:, :, 0]
+    tracks, zero = Track(*map(jnp.asarray, tracks)), jnp.zeros(tracks.yaw.shape[:2], jnp.float32)
+    first, last = (Track(*(leaf[:, :, step] for leaf in tracks)) for step in (0, -1))
     agents = Agents(
-        position=tracks.position[:, :, 0],
-        yaw=tracks.yaw[:, :, 0],
-        speed=np.maximum(np.sum(start * np.stack([np.cos(tracks.yaw[:, :, 0]), np.sin(tracks.yaw[:, :, 0])], -1), -1), 0.0),
-        size=np.asarray(size, np.float32),
-        goal=tracks.position[:, :, -1],
+        position=first.position,
+        yaw=first.yaw,
+        speed=jnp.maximum(dot(first.velocity, heading_vector(first.yaw)), 0.0),
+        size=jnp.asarray(size, jnp.float32),
+        goal=last.position,
         route_length=zero + 1.0,
-        present=np.ones(zero.shape, bool),
-        route=zero.astype(np.int32),
+        present=jnp.ones(zero.shape, bool),
+        route=zero.astype(jnp.int32),
         route_start=zero,
         route_end=zero,
     )
-    log = AgentLog(tracks.position, tracks.yaw, tracks.velocity, np.ones(tracks.yaw.shape, bool), np.asarray(scene.log.dt))
+    log = AgentLog(tracks.position, tracks.yaw, tracks.velocity, jnp.ones(tracks.yaw.shape, bool), jnp.asarray(scene.log.dt))
     return replace(scene, agents=agents, log=log)
 
 
