@@ -13,6 +13,7 @@ from scenefactory_jax.evaluation.adversary import costs, kinematics
 from scenefactory_jax.evaluation.adversary.ego_drive import EGO
 from scenefactory_jax.evaluation.adversary.kinematics import Track
 from scenefactory_jax.evaluation.adversary.settings import AttackSettings
+from scenefactory_jax.evaluation.scoring import STEP_S
 
 REASONS = ("no_vehicle", "absent", "standing", "behind", "far", "not_followed")  # why a road user is no adversary
 
@@ -57,11 +58,11 @@ def choose_adversaries(
     ratio = bearing / jnp.where(turned == 0.0, 1.0, turned)
     swings = (jnp.abs(bearing) < rules.ahead_rad) & (jnp.abs(turned) < jnp.pi / 2) & (ratio > 0.0) & (ratio < 1.0) & (turned != 0.0)
 
-    limits, dt = settings.limits, scene.log.dt
+    limits = settings.limits
     start = kinematics.start_bodies(*(leaf[:, 0] for leaf in logged))
     top_speed_limit = jnp.maximum(limits.top_speed_factor * top_speed, limits.top_speed_mps)
     actions, followed = kinematics.reconstruct_actions(
-        start, logged, valid, top_speed_limit, limits, feedback_radps=settings.search.feedback_radps, dt=dt
+        start, logged, valid, top_speed_limit, limits, feedback_radps=settings.search.feedback_radps, dt=STEP_S
     )
     error = jnp.max(jnp.where(valid, safe_norm(followed.position - logged.position), 0.0), axis=1)
     reasons = {

@@ -1,6 +1,6 @@
 """Motion of adversaries: actions that follow logged tracks, and the states that follow from actions, through Waymax's bicycle."""
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -27,7 +27,9 @@ def start_bodies(position: Float[Array, "K 2"], yaw: Float[Array, " K"], velocit
     return Body(position, yaw, speed[:, None] * heading_vector(yaw), zero, zero, zero, zero, zero)
 
 
-def limit_action(body: Body, action: Float[Array, "K 2"], top_speed: Float[Array, " K"], limits: Limits, *, dt: Any) -> Float[Array, "K 2"]:
+def limit_action(
+    body: Body, action: Float[Array, "K 2"], top_speed: Float[Array, " K"], limits: Limits, *, dt: float
+) -> Float[Array, "K 2"]:
     """Limits accelerations (m/s^2) and curvatures (1/m) to what the cars can do at their speeds; braking ends at rest."""
     speed = safe_norm(body.velocity)
     strongest = jnp.minimum(limits.acceleration_mps2, limits.power_m2ps3 / jnp.maximum(speed, SLOW_MPS))
@@ -42,7 +44,7 @@ def find_sharpest(speed: Float[Array, "*n"], limits: Limits) -> Float[Array, "*n
     return jnp.minimum(limits.curvature_radpm, limits.lateral_mps2 / jnp.maximum(speed, SLOW_MPS) ** 2)
 
 
-def simulate(start: Body, actions: Float[Array, "K T 2"], top_speed: Float[Array, " K"], limits: Limits, *, dt: Any) -> Track:
+def simulate(start: Body, actions: Float[Array, "K T 2"], top_speed: Float[Array, " K"], limits: Limits, *, dt: float) -> Track:
     """Simulates actions within the limits; differentiable in the actions. The track has one state more than there are actions."""
 
     def step(body: Body, action: Float[Array, "K 2"]) -> tuple[Body, Body]:
@@ -62,7 +64,7 @@ def reconstruct_actions(
     limits: Limits,
     *,
     feedback_radps: float,
-    dt: Any,
+    dt: float,
 ) -> tuple[Float[Array, "K M 2"], Track]:
     """Computes actions within the limits that follow logged tracks, and the states that they lead to, one step after the other.
 

@@ -15,6 +15,7 @@ from scenefactory_jax.evaluation.adversary.ego_drive import EGO, Contact, Drive,
 from scenefactory_jax.evaluation.adversary.eligibility import Adversaries, choose_adversaries
 from scenefactory_jax.evaluation.adversary.kinematics import Track
 from scenefactory_jax.evaluation.adversary.settings import AttackSettings
+from scenefactory_jax.evaluation.scoring import STEP_S
 
 SPARSE = 4  # of so many states one is read to find the road around them
 OFF_ROAD_M = 0.05  # farther than its log is an adversary off the road
@@ -73,7 +74,7 @@ def attack_world(
         steps: of an episode.
     """
     chosen, reasons = choose_adversaries(scene, settings, start_row=start_row, steps=steps)
-    problem, dt, ego_size = make_logged_problem(scene, chosen, settings, start_row=start_row), scene.log.dt, scene.agents.size[EGO]
+    problem, ego_size = make_logged_problem(scene, chosen, settings, start_row=start_row), scene.agents.size[EGO]
     optimizer = make_optimizer(settings, chosen.steers & chosen.eligible)
     change = jnp.zeros_like(chosen.actions)
     seen: Drive = _make_zeros(drive, parameters, scene, key)
@@ -83,10 +84,10 @@ def attack_world(
     def run_round(carry: tuple, number: Int[Array, ""]) -> tuple[tuple, None]:
         change, memory, driven, outcome, plain, _ = carry
         logged = number == 0
-        loss = lambda change: compute_cost(change, driven.ego, ego_size, problem, settings, dt)  # noqa: E731
+        loss = lambda change: compute_cost(change, driven.ego, ego_size, problem, settings)  # noqa: E731
         better = descend(loss, change, memory, optimizer, iterations=settings.search.iterations, settings=settings)
         change, memory = jax.tree.map(lambda old, new: jnp.where(logged, old, new), (change, memory), better)
-        track = move(change, problem, settings, dt)
+        track = move(change, problem, settings)
         attacked = ego_drive.insert_tracks(scene, chosen.row, chosen.eligible & ~logged, track, chosen.present, start_row=start_row)
         driven = drive(parameters, attacked, key)
         now = judge(scene, driven, track, problem, settings)
@@ -96,7 +97,7 @@ def attack_world(
         return jax.tree.map(lambda old, new: jnp.where(outcome.success, old, new), carry, after), None
 
     (change, _, driven, outcome, plain, rounds), _ = jax.lax.scan(run_round, begun, jnp.arange(settings.search.rounds + 1))
-    return Attack(chosen, reasons, plain, move(change, problem, settings, dt), driven, outcome, rounds)
+    return Attack(chosen, reasons, plain, move(change, problem, settings), driven, outcome, rounds)
 
 
 def _make_zeros(function: Callable[..., Any], *arguments: Any) -> Any:
@@ -176,19 +177,19 @@ def _list_pairs(chosen: Adversaries) -> Bool[Array, "K K T"]:
     return first[..., None] & there[:, None] & there[None]
 
 
-def move(change: Float[Array, "K M 2"], problem: Problem, settings: AttackSettings, dt: Any) -> Track:
+def move(change: Float[Array, "K M 2"], problem: Problem, settings: AttackSettings) -> Track:
     """Simulates the adversaries with changed actions."""
     chosen = problem.chosen
     actions = chosen.actions + change * problem.scale
-    return kinematics.simulate(chosen.start, actions, chosen.top_speed, settings.limits, dt=dt)
+    return kinematics.simulate(chosen.start, actions, chosen.top_speed, settings.limits, dt=STEP_S)
 
 
 def compute_cost(
-    change: Float[Array, "K M 2"], ego: Track, ego_size: Float[Array, "2"], problem: Problem, settings: AttackSettings, dt: Any
+    change: Float[Array, "K M 2"], ego: Track, ego_size: Float[Array, "2"], problem: Problem, settings: AttackSettings
 ) -> Float[Array, ""]:
     """Computes the cost of changed actions: the approach to the ego and those of `compute_upkeep`."""
     weights, chosen = settings.costs, problem.chosen
-    track = move(change, problem, settings, dt)
+    track = move(change, problem, settings)
     bearing = jnp.abs(costs.find_bearing(ego.position, ego.yaw, jax.lax.stop_gradient(track.position)))
     counted = chosen.present & chosen.eligible[:, None] & (bearing < settings.eligibility.behind_rad)
     body = costs.cover(Track(*(leaf[None] for leaf in ego)), ego_size[None])

@@ -14,6 +14,7 @@ from scenefactory_jax.evaluation.adversary.eligibility import Adversaries
 from scenefactory_jax.evaluation.adversary.kinematics import Track
 from scenefactory_jax.evaluation.adversary.search import Attack
 from scenefactory_jax.evaluation.adversary.settings import AttackSettings
+from scenefactory_jax.evaluation.scoring import STEP_S
 
 
 class Solution(NamedTuple):
@@ -44,7 +45,7 @@ def solve_by_gradient(scene: Scene, attack: Attack, settings: AttackSettings) ->
     Solved: it touches nothing and stays on the road, as far as its drive did. The ego knows what will happen; so this says that a way
     exists, not that a driver would find it.
     """
-    solution, dt = settings.solution, scene.log.dt
+    solution = settings.solution
     weights = dataclasses.replace(settings.costs, repulsion=solution.repulsion)
     settings = dataclasses.replace(settings, costs=weights)
     ego = _make_candidate(scene, attack, settings)
@@ -53,10 +54,10 @@ def solve_by_gradient(scene: Scene, attack: Attack, settings: AttackSettings) ->
     problem = search.make_problem(scene, ego, *around, settings)
     problem = problem._replace(margin=jnp.full_like(problem.margin, solution.margin_m))
     optimizer = search.make_optimizer(settings, ego.steers)
-    loss = lambda change: search.compute_upkeep(change, search.move(change, problem, settings, dt), problem, settings)  # noqa: E731
+    loss = lambda change: search.compute_upkeep(change, search.move(change, problem, settings), problem, settings)  # noqa: E731
     change = jnp.zeros_like(ego.actions)
     change, _ = search.descend(loss, change, optimizer.init(change), optimizer, iterations=solution.iterations, settings=settings)
-    track = search.move(change, problem, settings, dt)
+    track = search.move(change, problem, settings)
     touches = jnp.any(search.find_overlapping(track, attack.drive.traffic, problem))
     outside = costs.compute_outside(track.position, track.yaw, ego.size[:, None], problem.road, half_lane_m=weights.half_lane_m)
     leaves_road = jnp.any(jnp.max(outside, axis=-1) > problem.allowed[:, None] + search.OFF_ROAD_M)
@@ -70,7 +71,7 @@ def _make_candidate(scene: Scene, attack: Attack, settings: AttackSettings) -> A
     limits, everywhere = settings.limits, jnp.ones(logged.yaw.shape, bool)
     start = kinematics.start_bodies(*(leaf[:, 0] for leaf in logged))
     top_speed = jnp.maximum(limits.top_speed_factor * jnp.max(costs.find_speed(logged), axis=1), limits.top_speed_mps)
-    numbers = {"feedback_radps": settings.search.feedback_radps, "dt": scene.log.dt}
+    numbers = {"feedback_radps": settings.search.feedback_radps, "dt": STEP_S}
     actions, followed = kinematics.reconstruct_actions(start, logged, everywhere, top_speed, limits, **numbers)
     one = jnp.ones(1, bool)
     row = jnp.full(1, traffic.yaw.shape[1])  # none of the traffic

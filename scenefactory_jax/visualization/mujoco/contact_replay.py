@@ -46,7 +46,7 @@ def replay_pairs(settings: Mapping[str, Any], scene: Scene, tracks: Track, size:
         seconds: of a replay.
     """
     control_hz = float(settings["timing"]["control_hz"])
-    pairs = make_pairs(scene, tracks, size)
+    pairs = jax.vmap(make_pair)(replace(scene, road_grid=None), Track(*map(jnp.asarray, tracks)), jnp.asarray(size, jnp.float32))
     contact, actions = jax.device_get(_drive(settings, pairs, steps=round(seconds * control_hz)))
     with tempfile.TemporaryDirectory() as folder:
         steps = [_replay_in_c(settings, pairs, actions, number, Path(folder)) for number in range(len(size))]
@@ -54,24 +54,23 @@ def replay_pairs(settings: Mapping[str, Any], scene: Scene, tracks: Track, size:
     return Replays(np.array([find(touches) for touches in contact]), np.array([find(touches) for touches in steps]))
 
 
-def make_pairs(scene: Scene, tracks: Track, size: Float[np.ndarray, "N 2 2"]) -> Scene:
-    """Makes worlds of two agents that start as their trajectories do and have these as logs; the rest of the scene stays."""
-    tracks, zero = Track(*map(jnp.asarray, tracks)), jnp.zeros(tracks.yaw.shape[:2], jnp.float32)
-    first, last = (Track(*(leaf[:, :, step] for leaf in tracks)) for step in (0, -1))
+def make_pair(scene: Scene, tracks: Track, size: Float[Array, "2 2"]) -> Scene:
+    """Makes a world of two agents that start as their trajectories do and have these as logs; the rest of the scene stays."""
+    zero = jnp.zeros(PAIR, jnp.float32)
+    first, last = (Track(*(leaf[:, step] for leaf in tracks)) for step in (0, -1))
     agents = Agents(
         position=first.position,
         yaw=first.yaw,
         speed=jnp.maximum(dot(first.velocity, heading_vector(first.yaw)), 0.0),
-        size=jnp.asarray(size, jnp.float32),
+        size=size,
         goal=last.position,
         route_length=zero + 1.0,
-        present=jnp.ones(zero.shape, bool),
+        present=jnp.ones(PAIR, bool),
         route=zero.astype(jnp.int32),
         route_start=zero,
         route_end=zero,
     )
-    log = AgentLog(tracks.position, tracks.yaw, tracks.velocity, jnp.ones(tracks.yaw.shape, bool), jnp.asarray(scene.log.dt))
-    return replace(scene, agents=agents, log=log)
+    return replace(scene, agents=agents, log=AgentLog(*tracks, jnp.ones(tracks.yaw.shape, bool), scene.log.dt))
 
 
 def _drive(settings: Mapping[str, Any], pairs: Scene, *, steps: int) -> tuple[Array, Array]:
@@ -96,7 +95,7 @@ def _replay_in_c(
     agents: Any = jax.tree.map(lambda leaf: np.asarray(leaf)[number : number + 1], pairs.agents)
     one = np.ones(1, np.float32)
     ground = make_open_ground(agents.position, agents.yaw, agents.speed, one, np.zeros(1, np.int32), size=(1.0, 1.0))
-    ground = jax.tree.map(lambda leaf: np.asarray(leaf)[0], replace(ground, agents=agents))
+    ground = replace(jax.tree.map(lambda leaf: np.asarray(leaf)[0], ground), agents=jax.tree.map(lambda leaf: leaf[0], agents))
     world = exported_world.write(folder / f"pair{number}.xml", settings, ground, seed=0)
     model, data, cars = mujoco_car.open_world(str(world))
     boxes = {model.geom(f"agent{slot}/box").id for slot in range(PAIR)}
