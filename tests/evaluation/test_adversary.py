@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from support.crossings import CURRENT, HALF_M, crossing, drive
+from support.crossings import CURRENT, HALF_M, crossing, drive, turn_off
 from support.hand_scenes import road_of
 from support.scene_banks import banked
 
@@ -17,7 +17,7 @@ from scenefactory_jax.core.boxes import find_overlaps
 from scenefactory_jax.core.schema import ConfigError
 from scenefactory_jax.data.bank import bank_reader
 from scenefactory_jax.data.loading import scene_source
-from scenefactory_jax.evaluation.adversary import costs, kinematics
+from scenefactory_jax.evaluation.adversary import costs, eligibility, kinematics
 from scenefactory_jax.evaluation.adversary.costs import RoadShape
 from scenefactory_jax.evaluation.adversary.kinematics import Track
 from scenefactory_jax.evaluation.adversary.settings import AttackSettings
@@ -27,7 +27,7 @@ pytestmark = pytest.mark.usefixtures("quickly")
 
 NORTH, STEPS, DT = np.pi / 2, 60, 0.1
 SMALL = ["scenes.pack.traffic=8", "step_metrics.kernels=false", "scenes.pack.routes.alternatives=1", f"timing.episode_s={STEPS / 10:g}"]
-CROSSER, PARKED, WALKER, FOLLOWER, ABSENT = 1, 2, 3, 4, 5
+CROSSER, PARKED, WALKER, FOLLOWER, ABSENT, TURNING = 1, 2, 3, 4, 5, 6
 
 
 def asked(path, out, *words):
@@ -43,7 +43,7 @@ def settings():
 
 @pytest.fixture(scope="module")
 def bank(tmp_path_factory):
-    """A crossing where a car from the south would pass the middle 1 s behind the ego; and one where nothing could be an adversary."""
+    """A crossing where a car from the south would pass the middle 1 s behind the ego; one where nothing could be an adversary; and one with a car that turns off."""
     seen = np.arange(91) < CURRENT + 5
     nobody = [
         drive(PARKED, (10.0, 20.0), NORTH, 0.0),
@@ -51,7 +51,9 @@ def bank(tmp_path_factory):
         drive(FOLLOWER, (-52.0, 0.0), 0.0, 8.0),
         drive(ABSENT, (0.0, 60.0), -NORTH, 8.0, valid=seen),
     ]
+    turning = turn_off(TURNING, ahead_m=15.0, speed=8.0, radius_m=20.0, leaves_s=3.1)
     raws = [crossing("met", drive(CROSSER, (0.0, -37.0), NORTH, 6.0), nobody[0]), crossing("alone", *nobody)]
+    raws.append(crossing("swings", drive(CROSSER, (0.0, -37.0), NORTH, 6.0), turning))
     return banked(tmp_path_factory.mktemp("crossings") / "bank", raws, described=False)
 
 
@@ -63,18 +65,19 @@ def attacked(bank, tmp_path_factory):
 
 
 def test_an_attack_makes_a_scene_of_every_eligible_one(bank, attacked):
-    met, alone = attacked.rows
+    met, alone = attacked.rows[:2]
     assert met["verdict"] == "kept" and met["adversaries"] == 1 and met["avoided_by_gradient"]
     assert alone["verdict"] == "no_adversary" and alone["collision_s"] is None
-    assert attacked.bank.names == ("met-adversarial",)
+    assert attacked.bank.names[0] == "met-adversarial" and "alone-adversarial" not in attacked.bank.names
     before, after = bank_reader.read_raw(bank, 0), bank_reader.read_raw(attacked.bank, 0)
     assert after.metadata["adversary"] == CROSSER and after.metadata["adversarial_of"] == "met" and after.metadata["attacked"] == "log"
     for old, new in zip(before.tracks, after.tracks, strict=True):
         rows = slice(None, CURRENT) if old.id == CROSSER else slice(None)
         np.testing.assert_array_equal(old.xyz[rows], new.xyz[rows])
     with (attacked.report.parent / "scenes.csv").open() as file:
-        assert [row["verdict"] for row in csv.DictReader(file)] == ["kept", "no_adversary"]
-    assert "| collision | 100.0% | 1 |" in attacked.report.read_text()
+        assert [row["verdict"] for row in csv.DictReader(file)] == [row["verdict"] for row in attacked.rows]
+    hits = sum(row["collision_s"] is not None for row in attacked.rows)
+    assert f"| collision | {hits / 2:.1%} | 2 |" in attacked.report.read_text(), "of the scenes that are eligible"
 
 
 def test_the_ego_meets_the_adversary_on_the_road_within_its_limits(attacked, settings):
@@ -92,6 +95,20 @@ def test_the_ego_meets_the_adversary_on_the_road_within_its_limits(attacked, set
     assert push.max() > 0.5, "it has to come sooner"
     on_street = np.abs(other.xyz[rows, :2]).min(axis=1)
     assert on_street.max() < HALF_M - 0.9
+
+
+def test_who_may_be_an_adversary_and_why_not(bank, settings):
+    """Followers, parked cars, people and what is not seen are left out by name; a car that turns off ahead of the ego must not steer."""
+    task = Tasks(asked(bank.path, "x")).make_planner("log")
+    scenes = scene_source.load_all_scenes({**task["scenes"], "path": str(bank.path)}, keep_raw=True)
+    choose = jax.jit(jax.vmap(lambda scene: eligibility.choose_adversaries(scene, settings, start_row=CURRENT, steps=STEPS)))
+    chosen, reasons = jax.device_get(choose(scenes.scene))
+    found = {track: {name for name, mask in reasons.items() if mask[1, row]} for row, track in enumerate(scenes.reports[1].traffic_ids)}
+    expected = {PARKED: "standing", WALKER: "no_vehicle", FOLLOWER: "behind", ABSENT: "absent"}
+    assert all(reason in found[track] for track, reason in expected.items()) and found[FOLLOWER] == {"behind"}
+    assert not chosen.eligible[1].any()
+    names = [scenes.reports[2].traffic_ids[row] for row in chosen.row[2][chosen.eligible[2]]]
+    assert dict(zip(names, chosen.steers[2][chosen.eligible[2]].tolist(), strict=True)) == {CROSSER: True, TURNING: False}
 
 
 def test_errors_name_the_key(bank, tmp_path):
@@ -192,7 +209,8 @@ def test_articulated_cars_and_the_c_engine_touch_where_trajectories_do(bank):
     scenes = scene_source.load_all_scenes({**task["scenes"], "path": str(bank.path)})
     meet = [tracks([[-20.0, 0.0], [0.0, -20.0 - late]], [0.0, NORTH], [8.0, 8.0]) for late in (0.0, 9.0)]
     pairs = Track(*(np.stack([np.asarray(leaf) for leaf in leaves]) for leaves in zip(*meet, strict=True)))
-    found = contact_replay.replay_pairs(task, jax.device_get(scenes.scene), pairs, np.full((2, 2, 2), [4.0, 2.0]), seconds=3.0)
+    worlds = jax.tree.map(lambda leaf: np.asarray(leaf)[:2], scenes.scene)
+    found = contact_replay.replay_pairs(task, worlds, pairs, np.full((2, 2, 2), [4.0, 2.0]), seconds=3.0)
     assert found.articulated_s[0] == pytest.approx((20.0 - 3.0) / 8.0, abs=0.15)
     assert found.c_engine_s[0] == pytest.approx(found.articulated_s[0], abs=0.1)
     assert np.isnan(found.articulated_s[1]) and np.isnan(found.c_engine_s[1])

@@ -43,3 +43,15 @@ def drive(number, place, yaw, speed, *, kind="vehicle", valid=None) -> Track:
     xyz = np.where(valid[:, None], np.column_stack([xy, np.zeros(STEPS)]), 0.0)
     velocity = np.where(valid[:, None], speed * facing, 0.0)
     return Track(number, kind, (4.6, 1.9, 1.5), xyz, np.where(valid, yaw, 0.0), velocity, valid)
+
+
+def turn_off(number, *, ahead_m, speed, radius_m, leaves_s) -> Track:
+    """A car ahead of the ego that turns left from the current step on, and is not seen any more after some seconds."""
+    time = 0.1 * (np.arange(STEPS) - CURRENT)
+    angle = np.maximum(speed * time, 0.0) / radius_m
+    straight = np.minimum(speed * time, 0.0)
+    xy = np.array([-40.0 + ahead_m, 0.0]) + np.stack([straight + radius_m * np.sin(angle), radius_m * (1.0 - np.cos(angle))], axis=1)
+    valid = time <= leaves_s
+    xyz = np.where(valid[:, None], np.column_stack([xy, np.zeros(STEPS)]), 0.0)
+    velocity = np.where(valid[:, None], speed * np.stack([np.cos(angle), np.sin(angle)], axis=1), 0.0)
+    return Track(number, "vehicle", (4.6, 1.9, 1.5), xyz, np.where(valid, angle, 0.0), velocity, valid)
