@@ -138,8 +138,8 @@ class Tasks:
             return self.make_planner(self.config["planner"]), {}
         run = policy_io.find(self.config["run"])
         trained = configs.read(run, trust=self.config["trust"])
-        task = {**configs.apply_overrides(trained, self.overrides), "termination": self.termination}  # a policy drives the car that it knows
-        return task, checkpoint.restore_parameters(run / "checkpoints")
+        task = configs.apply_overrides(trained, self.overrides)  # a policy drives the car that it knows
+        return {**task, "termination": self.termination}, checkpoint.restore_parameters(run / "checkpoints")
 
     def make_planner(self, planner: str, *more: str, attacks: bool = True) -> dict[str, Any]:
         """The config of an environment with a planner; `attacks`: with the dynamics of the search."""

@@ -43,7 +43,7 @@ def settings():
 
 @pytest.fixture(scope="module")
 def bank(tmp_path_factory):
-    """A crossing where a car from the south would pass the middle 1 s behind the ego; one where nothing could be an adversary; and one with a car that turns off."""
+    """Crossings: a car from the south would pass the middle 1 s behind the ego; nothing could be an adversary; a car turns off, too."""
     seen = np.arange(91) < CURRENT + 5
     nobody = [
         drive(PARKED, (10.0, 20.0), NORTH, 0.0),
