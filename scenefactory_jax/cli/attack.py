@@ -100,7 +100,7 @@ def attack(config: Mapping[str, Any]) -> Attacked:
     device = f"{jax.devices()[0].device_kind}, {jax.default_backend()}"
     facts = {"ego": name, "command": run_config.format_command("attack"), "device": device, "seconds_per_scene": result.seconds_per_scene}
     report = attack_report.write(folder, rows, worlds, **facts)
-    print(attack_report.format_summary(attack_report.summarise(rows, seconds_per_scene=result.seconds_per_scene)))
+    print(attack_report.format_summary({name: attack_report.summarise(rows, seconds_per_scene=result.seconds_per_scene)}))
     print(f"{f'{out}: {len(bank)} scenes' if bank else 'no scene is kept: no bank is written'}\nreport {report}", flush=True)
     return Attacked(rows, bank, report)
 

@@ -10,6 +10,7 @@ from support.crossings import CURRENT, HALF_M, crossing, drive, turn_off
 from support.hand_scenes import road_of
 from support.scene_banks import banked
 
+from experiments.adversaries import table
 from scenefactory_jax.cli import hydra_config
 from scenefactory_jax.cli.attack import PARTS, Tasks, attack
 from scenefactory_jax.core import schema
@@ -77,7 +78,8 @@ def test_an_attack_makes_a_scene_of_every_eligible_one(bank, attacked):
     with (attacked.report.parent / "scenes.csv").open() as file:
         assert [row["verdict"] for row in csv.DictReader(file)] == [row["verdict"] for row in attacked.rows]
     hits = sum(row["collision_s"] is not None for row in attacked.rows)
-    assert f"| collision | {hits / 2:.1%} | 2 |" in attacked.report.read_text(), "of the scenes that are eligible"
+    assert f"| collision | {hits / 2:.1%} [" in attacked.report.read_text(), "of the scenes that are eligible"
+    assert "of 2 |" in table.format_table({"a": attacked.report.parent, "b": attacked.report.parent}).split("| collision |")[1]
 
 
 def test_the_ego_meets_the_adversary_on_the_road_within_its_limits(attacked, settings):

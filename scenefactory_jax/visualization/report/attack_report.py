@@ -6,12 +6,13 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from scenefactory_jax.core import markdown
+from scenefactory_jax.core import markdown, result_file
+from scenefactory_jax.evaluation import statistics
 from scenefactory_jax.evaluation.adversary.attack import KEPT, VERDICTS
 from scenefactory_jax.visualization.birds_eye.attack_figures import AttackedWorld, attack_figure
 from scenefactory_jax.visualization.report import document, plots
 
-REPORT, TABLE = "report.md", "scenes.csv"
+REPORT, TABLE, RESULT, TIME = "report.md", "scenes.csv", "result.json", "seconds_per_scene"
 INELIGIBLE = ("no_adversary", "collides_anyway")
 HIT_BUT_DROPPED = ("unsolvable", "no_contact_of_cars")  # the attack succeeded
 
@@ -37,14 +38,25 @@ def summarise(rows: Sequence[Mapping[str, Any]], *, seconds_per_scene: float) ->
         if asked:
             found[f"reproduced_{engine}"] = share([row[f"reproduced_{engine}"] for row in asked], asked)
     found["kept"] = share([row["verdict"] == KEPT for row in rows], rows)
-    return found | {"seconds_per_scene": (seconds_per_scene, len(rows))}
+    return found | {TIME: (seconds_per_scene, len(rows))}
 
 
-def format_summary(summary: Mapping[str, tuple[float, int]]) -> str:
-    """Formats the shares as a table."""
-    cells = lambda name, value: f"{value:.2f} s" if name == "seconds_per_scene" else f"{value:.1%}"  # noqa: E731
-    rows = [[name.replace("_", " "), cells(name, value) if count else "", count] for name, (value, count) in summary.items()]
-    return markdown.format_table(["share", "value", "of scenes"], rows)
+def format_summary(summaries: Mapping[str, Mapping[str, Sequence[Any]]]) -> str:
+    """Formats the shares of attacks as a table, a column for each ego, with 95 % intervals (Wilson) and the numbers of scenes."""
+    names = list(dict.fromkeys(name for summary in summaries.values() for name in summary))
+    cells = lambda name: [format_share(name, *summary.get(name, (0.0, 0))) for summary in summaries.values()]  # noqa: E731
+    rows = [[name.replace("_", " "), *cells(name)] for name in names]
+    return markdown.format_table(["share", *summaries], rows)
+
+
+def format_share(name: str, value: float, count: int) -> str:
+    """Formats a share with its interval and the number of scenes; empty without any."""
+    if not count:
+        return ""
+    if name == TIME:
+        return f"{value:.2f} s"
+    low, high = statistics.wilson(value, count)
+    return f"{value:.1%} [{low:.1%}, {high:.1%}] of {count}"
 
 
 def write(
@@ -63,6 +75,8 @@ def write(
         table = csv.DictWriter(file, list(dict.fromkeys(name for row in rows for name in row)))
         table.writeheader()
         table.writerows(rows)
+    summary = summarise(rows, seconds_per_scene=seconds_per_scene)
+    result_file.write(folder / RESULT, {"ego": ego, "command": command, "device": device, "summary": summary}, digits=6)
     pictures = [plots.save(attack_figure(world), folder / f"scene-{number}.png") for number, world in enumerate(worlds)]
     counts = Counter(row["verdict"] for row in rows)
     verdicts = [[name.replace("_", " "), counts[name], text] for name, text in VERDICTS.items() if counts[name]]
@@ -70,7 +84,7 @@ def write(
         folder / REPORT,
         f"# Attacks on {ego}",
         f"`{command}` on {device}",
-        format_summary(summarise(rows, seconds_per_scene=seconds_per_scene)),
+        format_summary({ego: summary}),
         document.section("Scenes", markdown.format_table(["verdict", "scenes", "meaning"], verdicts), f"[All scenes]({TABLE})"),
         document.section(
             "Pictures",
