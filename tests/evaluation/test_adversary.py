@@ -15,11 +15,14 @@ from scenefactory_jax.cli import hydra_config
 from scenefactory_jax.cli.attack import PARTS, Tasks, attack
 from scenefactory_jax.core import schema
 from scenefactory_jax.core.boxes import find_overlaps
+from scenefactory_jax.core.pytree import unchecked
 from scenefactory_jax.core.schema import ConfigError
+from scenefactory_jax.core.types import Boxes
 from scenefactory_jax.data.bank import bank_reader
 from scenefactory_jax.data.loading import scene_source
 from scenefactory_jax.evaluation.adversary import costs, eligibility, kinematics
 from scenefactory_jax.evaluation.adversary.costs import RoadShape
+from scenefactory_jax.evaluation.adversary.ego_drive import Drive, find_first_contact
 from scenefactory_jax.evaluation.adversary.kinematics import Track
 from scenefactory_jax.evaluation.adversary.settings import AttackSettings
 from scenefactory_jax.visualization.mujoco import contact_replay
@@ -56,6 +59,13 @@ def bank(tmp_path_factory):
     raws = [crossing("met", drive(CROSSER, (0.0, -37.0), NORTH, 6.0), nobody[0]), crossing("alone", *nobody)]
     raws.append(crossing("swings", drive(CROSSER, (0.0, -37.0), NORTH, 6.0), turning))
     return banked(tmp_path_factory.mktemp("crossings") / "bank", raws, described=False)
+
+
+@pytest.fixture(scope="module")
+def loaded(bank):
+    """The scenes, packed."""
+    task = Tasks(asked(bank.path, "x")).make_planner("log")
+    return scene_source.load_all_scenes({**task["scenes"], "path": str(bank.path)}, keep_raw=True)
 
 
 @pytest.fixture(scope="module")
@@ -99,18 +109,36 @@ def test_the_ego_meets_the_adversary_on_the_road_within_its_limits(attacked, set
     assert on_street.max() < HALF_M - 0.9
 
 
-def test_who_may_be_an_adversary_and_why_not(bank, settings):
+def test_who_may_be_an_adversary_and_why_not(loaded, settings):
     """Followers, parked cars, people and what is not seen are left out by name; a car that turns off ahead of the ego must not steer."""
-    task = Tasks(asked(bank.path, "x")).make_planner("log")
-    scenes = scene_source.load_all_scenes({**task["scenes"], "path": str(bank.path)}, keep_raw=True)
     choose = jax.jit(jax.vmap(lambda scene: eligibility.choose_adversaries(scene, settings, start_row=CURRENT, steps=STEPS)))
-    chosen, reasons = jax.device_get(choose(scenes.scene))
-    found = {track: {name for name, mask in reasons.items() if mask[1, row]} for row, track in enumerate(scenes.reports[1].traffic_ids)}
+    chosen, reasons = jax.device_get(choose(loaded.scene))
+    found = {track: {name for name, mask in reasons.items() if mask[1, row]} for row, track in enumerate(loaded.reports[1].traffic_ids)}
     expected = {PARKED: "standing", WALKER: "no_vehicle", FOLLOWER: "behind", ABSENT: "absent"}
     assert all(reason in found[track] for track, reason in expected.items()) and found[FOLLOWER] == {"behind"}
     assert not chosen.eligible[1].any()
-    names = [scenes.reports[2].traffic_ids[row] for row in chosen.row[2][chosen.eligible[2]]]
+    names = [loaded.reports[2].traffic_ids[row] for row in chosen.row[2][chosen.eligible[2]]]
     assert dict(zip(names, chosen.steers[2][chosen.eligible[2]].tolist(), strict=True)) == {CROSSER: True, TURNING: False}
+
+
+def test_a_contact_from_behind_is_none_of_the_ego(loaded):
+    """An ego that stands is run into by its follower: touched, but no contact that counts. Across the follower's way, it is one."""
+    row = loaded.reports[1].traffic_ids.index(FOLLOWER)
+    scene = jax.tree.map(lambda leaf: jnp.asarray(leaf[1]), loaded.scene)
+    log, rows = scene.traffic_log, slice(CURRENT, CURRENT + STEPS + 1)
+    count = STEPS + 1
+    over_time = lambda table: jnp.swapaxes(table[:, rows], 0, 1)  # noqa: E731
+    zero, size = jnp.zeros((count, len(log.kind))), jnp.broadcast_to(log.size, (count, *log.size.shape))
+    present = over_time(log.valid)
+    boxes = unchecked(
+        Boxes, position=over_time(log.position), elevation=zero, yaw=over_time(log.yaw), velocity=over_time(log.velocity), yaw_rate=zero,
+        size=size, mass=zero, present=present,
+    )  # fmt: skip
+    still = jnp.broadcast_to(scene.agents.position[0], (count, 2))
+    look = jax.jit(lambda yaw: find_first_contact(scene, Drive(Track(still, jnp.full(count, yaw), jnp.zeros((count, 2))), boxes)))
+    behind, beside = look(0.0), look(NORTH)
+    assert bool(behind.touched[row]) and not bool(behind.found)
+    assert bool(beside.found) and int(beside.row) == row and bool(beside.other_at_fault) and not bool(beside.ego_at_fault)
 
 
 def test_errors_name_the_key(bank, tmp_path):
@@ -205,13 +233,12 @@ def test_approach_and_repulsion_pull_and_push():
     assert float(slope) == pytest.approx(0.0, abs=1e-3) and float(deep) < 0.0, "a contact deep enough gains nothing"
 
 
-def test_articulated_cars_and_the_c_engine_touch_where_trajectories_do(bank):
+def test_articulated_cars_and_the_c_engine_touch_where_trajectories_do(bank, loaded):
     """Two pairs: one meets in the middle after 2.5 s, one passes 1 s apart."""
     task = Tasks(asked(bank.path, "x")).make_planner("expert", "observations.log.start_row=0", "traffic=none", attacks=False)
-    scenes = scene_source.load_all_scenes({**task["scenes"], "path": str(bank.path)})
     meet = [tracks([[-20.0, 0.0], [0.0, -20.0 - late]], [0.0, NORTH], [8.0, 8.0]) for late in (0.0, 9.0)]
     pairs = Track(*(np.stack([np.asarray(leaf) for leaf in leaves]) for leaves in zip(*meet, strict=True)))
-    worlds = jax.tree.map(lambda leaf: np.asarray(leaf)[:2], scenes.scene)
+    worlds = jax.tree.map(lambda leaf: np.asarray(leaf)[:2], loaded.scene)
     found = contact_replay.replay_pairs(task, worlds, pairs, np.full((2, 2, 2), [4.0, 2.0]), seconds=3.0)
     assert found.articulated_s[0] == pytest.approx((20.0 - 3.0) / 8.0, abs=0.15)
     assert found.c_engine_s[0] == pytest.approx(found.articulated_s[0], abs=0.1)
