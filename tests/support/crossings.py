@@ -3,6 +3,7 @@
 import numpy as np
 
 from scenefactory_jax.core.raw_scene import Polyline, RawScene, Track
+from scenefactory_jax.core.types import RoadUser
 
 HALF_M, REACH_M, STEPS, CURRENT = 4.0, 120.0, 91, 10  # half the width of the streets, half their length
 
@@ -34,7 +35,7 @@ def list_roads():
         yield Polyline(kind=15, xyz=corner @ np.array([[cos, sin, 0.0], [-sin, cos, 0.0], [0.0, 0.0, 1.0]]), id=10 + number)
 
 
-def drive(number, place, yaw, speed, *, kind="vehicle", valid=None) -> Track:
+def drive(number, place, yaw, speed, *, kind: RoadUser = "vehicle", valid=None) -> Track:
     """A track at constant speed that is at `place` at the current step."""
     time = 0.1 * (np.arange(STEPS) - CURRENT)
     facing = np.array([np.cos(yaw), np.sin(yaw)])
