@@ -15,6 +15,7 @@ COMMANDS = {  # name -> purpose, and the keys to begin with
     "train": ("Train a policy.", "experiment=demo|quick|paper|smoke scenes=womd scenes.path=FOLDER"),
     "record": ("Record an expert's samples for imitation.", "out=FOLDER spawning=logged scenes.path=FOLDER"),
     "evaluate": ("Evaluate a policy on held-out scenes.", "run=RUN scenes.path=FOLDER protocol=recorded|paper|strict|trained"),
+    "attack": ("Make adversarial scenes.", "planner=idm_route scenes.path=BANK out=BANK"),
     "compare": ("Compare training runs.", "runs='[runs/A-*,runs/B]' out=FOLDER"),
     "export": ("Export a policy to one small folder.", "run=RUN out=FOLDER"),
     "convert": ("Convert scene files to a bank.", "source=FILE_OR_FOLDER out=BANK"),

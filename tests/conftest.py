@@ -15,7 +15,7 @@ LONGEST = (  # files that take longest, by CPU time: started first, or one worke
     "test_validation_run", "test_film", "test_benchmark",
     "test_scoring", "test_planners", "test_planner_evaluation", "test_vmax_golden", "test_wosac_golden",
     "test_randomization", "test_traffic", "test_adapters", "test_troubleshooting", "test_adapters_gymnasium", "test_pretrained",
-    "test_dynamics", "test_record", "test_recorded_samples", "test_copo",
+    "test_adversary", "test_dynamics", "test_record", "test_recorded_samples", "test_copo",
     "test_patches_and_rain", "test_banks", "test_gpu_processes", "test_contact_solver", "test_episode_metrics", "test_pdm_closed",
     "test_ppo", "test_learners", "test_train_learners", "test_equations_of_motion", "test_collision", "test_extension", "test_tyres",
     "test_optimization", "test_sharding", "test_unvectorised_baseline", "test_failures", "test_fault_isolation", "test_operations",

@@ -41,6 +41,7 @@ SMALL = {
     ],
     "scenes": ["progress=false", "check.max_pictures=2"],
     "convert": ["progress=false"],
+    "attack": ["worlds=2", "search.rounds=2", "solution.planners=[]", "contact.enable=false", "pictures=1"],
 }
 
 pytestmark = pytest.mark.slow

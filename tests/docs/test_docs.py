@@ -31,7 +31,7 @@ def test_links_lead_somewhere(page):
 def test_commands_of_the_pages_compose(page):
     """Every key and option exists; what they name on disk is the reader's."""
     for command, *words in commands(page):
-        swept = ("seed=", "weather=", "ppo.gamma=")  # of a sweep, the first value
+        swept = ("seed=", "weather=", "ppo.gamma=", "planner=")  # of a sweep, the first value
         settings = [word.split(",")[0] if word.startswith(swept) else word for word in words if word not in ("-m", "--cfg", "job")]
         launched = [word for word in settings if not word.startswith("hydra")]
         assert hydra_config.load_config(command, *launched)
