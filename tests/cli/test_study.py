@@ -396,7 +396,9 @@ def steps_of(config):
     return math.prod([config["iterations"], config["worlds"], config["ppo"]["horizon"], config["actions"]["action_repeat"]])
 
 
-TIMED = {"vmax": "vmax", "scenarionet": "scenarionet", "curriculum": "scenarionet", "learners": "route100"}  # study -> its protocol
+TIMED = {"vmax": "vmax", "plants": "vmax", "scenarionet": "scenarionet", "curriculum": "scenarionet"}  # study -> its protocol
+TIMED |= {"learners": "route100"}
+MANY = ("curriculum", "plants")  # environments
 TWINS = {"rewards_laptop", "network_laptop"}  # nearly the same variants as another study, for a CPU
 
 
@@ -405,7 +407,7 @@ def test_names_of_a_study_fit_each_other(name):
     study_plan.check(hydra_config.load_config("study", f"study={name}"))
 
 
-@pytest.mark.parametrize("name", [pytest.param(n, marks=[pytest.mark.slow] if n == "curriculum" else []) for n in sorted(TIMED)])
+@pytest.mark.parametrize("name", [pytest.param(n, marks=[pytest.mark.slow] if n in MANY else []) for n in sorted(TIMED)])
 def test_every_row_of_a_study_of_equal_time_builds(name, tmp_path):
     """Every learner finds its keys and its network, all judge by the study's protocol, and each row has its time."""
     entry = hydra_config.load_config("study", f"study={name}", f"runs={tmp_path}", "train_scenes=train.bank", "test_scenes=test.bank")
@@ -417,9 +419,14 @@ def test_every_row_of_a_study_of_equal_time_builds(name, tmp_path):
     for one in {one.program: one for one in plan.evaluations}.values():
         environment.make_parts(one.config)
         assert (one.scores is None) == (name == "learners")
-    kinds = {one.program: one.config["learner"].get("actor") for one in plan.evaluations if one.weights == study_plan.TRAINED}
-    assert all(one.config["learner"].get("actor") == kinds.get(one.program) for one in plan.evaluations if one.program in kinds)
+    kinds = {one.program: actor_of(one) for one in plan.evaluations if one.weights == study_plan.TRAINED}
+    assert all(actor_of(one) == kinds.get(one.program) for one in plan.evaluations if one.program in kinds)
     assert not set(entry["study"]["planners"]) - {one.row for one in plan.evaluations}
+
+
+def actor_of(evaluation):
+    """What a learner's policy is built as; policies of before have no key `learner`."""
+    return evaluation.config.get("learner", {}).get("actor")
 
 
 def entry_minutes(entry):
