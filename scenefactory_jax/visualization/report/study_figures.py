@@ -177,7 +177,9 @@ def _draw_drops(result: Result, protocol: str) -> Figure | None:
 
     Conditions with the friction of the first one are left out; None if none are left.
     """
-    friction = {(row["row"], row["condition"]): row.get("friction") for row in _rows(result, protocol)}
+    friction: dict[tuple[str, str], float] = {
+        (row["row"], row["condition"]): row["friction"] for row in _rows(result, protocol) if "friction" in row
+    }
     lines: dict[str, dict[str, list[tuple[float, str, Mapping[str, Any]]]]] = {}
     for drop in result.get("drops", []):
         before, after = (friction.get((drop["row"], drop[end])) for end in ("before", "after"))
