@@ -16,7 +16,6 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
-from scenefactory_jax.core.geometry import heading_vector
 from scenefactory_jax.core.pytree import replace, unchecked
 from scenefactory_jax.core.schema import ConfigError, Count, NonNegative, Positive, Seed
 from scenefactory_jax.core.types import SURFACES, Patches, Scene, SurfaceName
@@ -144,7 +143,7 @@ def make_outlines(way: Way, begin: Float[np.ndarray, "W C"], extent: Float[np.nd
     made = np.zeros((*begin.shape, 2 * POINTS, 2), np.float32)
     for world, (position, yaw) in enumerate(zip(way.position, way.yaw, strict=True)):
         arc = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(position, axis=0), axis=1))])
-        heading = np.asarray(heading_vector(yaw))
+        heading = np.stack([np.cos(yaw), np.sin(yaw)], axis=-1)
         at = begin[world][:, None] + extent[world][:, None] * np.linspace(0.0, 1.0, POINTS)
         interpolate = lambda column, arc=arc, at=at: np.interp(at, arc, column)  # noqa: E731
         place, along = (np.stack([interpolate(column) for column in table.T], axis=-1) for table in (position, heading))

@@ -11,7 +11,7 @@ from jaxtyping import Float
 
 from scenefactory_jax.core.pytree import replace, unchecked
 from scenefactory_jax.core.raw_scene import SceneError
-from scenefactory_jax.core.types import SURFACES, Patches, Scene
+from scenefactory_jax.core.types import SURFACES, Patches, Scene, Weather
 from scenefactory_jax.data.packing.pack import PackReport
 
 KEY = "patches"  # of a scene's metadata
@@ -46,7 +46,7 @@ def attach_patches(scene: Scene, reports: Sequence[PackReport]) -> Scene:
     zeros = np.zeros(shape, np.float32)
     columns = {"vertices": vertices, "closed": present, "radius": zeros, "surface": surface, "film_mm": film_mm, "present": present}
     patches = unchecked(Patches, **columns, open_road_film_fraction=zeros)
-    return replace(scene, weather=replace(scene.weather, patches=patches))
+    return replace(scene, weather=unchecked(Weather, **{**vars(scene.weather), "patches": patches}))
 
 
 def _read(entry: Mapping[str, Any], report: PackReport) -> tuple[Float[np.ndarray, "V 2"], int, float]:
