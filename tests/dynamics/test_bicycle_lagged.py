@@ -1,0 +1,43 @@
+"""nuPlan's lags of the bicycle: commands act as first-order lags by implicit Euler steps, and without lags nothing changes."""
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from support import driving
+
+THROTTLE, STEER, BRAKE = 0.5, 0.25, 0.0
+STEPS = np.arange(1, driving.CHUNK + 1)
+
+
+@pytest.fixture(scope="module")
+def lagged():
+    """Bodies and motions of a second of a constant command, from 5 m/s."""
+    scene = driving.scene_for(speed=5.0)
+    return driving.drive("bicycle_lagged", scene, driving.constant(THROTTLE, STEER, BRAKE))[1]
+
+
+def test_acceleration_and_steering_approach_their_commands(lagged):
+    """x_n = command (1 - (lag / (dt + lag))^n): constants of nuPlan, 0.2 s and 0.05 s."""
+    body, motion = lagged
+    numbers, dt = driving.config("bicycle_lagged"), 1 / 30
+    assert (numbers["acceleration_lag_s"], numbers["steering_lag_s"]) == (0.2, 0.05)
+    steer = numbers["steering_limit"] * STEER * (1 - (0.05 / (dt + 0.05)) ** STEPS)
+    np.testing.assert_allclose(motion.steer[:, 0], steer, rtol=1e-5)
+    throttle = THROTTLE * (1 - (0.2 / (dt + 0.2)) ** STEPS)
+    np.testing.assert_allclose(body.command[:, 0, 0], throttle, rtol=1e-5)
+    speed = np.concatenate([[5.0], body.body.speed[:, 0]])
+    push = np.diff(speed) / dt + numbers["rolling"] + numbers["air_drag"] * speed[:-1] ** 2
+    np.testing.assert_allclose(push, numbers["acceleration"] * throttle, atol=2e-4)
+
+
+def test_released_pedals_are_at_zero_and_no_lags_are_the_plain_bicycle():
+    scene, command = driving.scene_for(speed=5.0), jnp.array([[-1.0, STEER, -1.0]] * 8)
+    plain, none = driving.make("bicycle"), driving.make("bicycle_lagged", acceleration_lag_s=0.0, steering_lag_s=0.0)
+    lagged = driving.make("bicycle_lagged")
+    start = lagged.init(driving.KEY, scene)
+    active = jnp.arange(8) < 4
+    after = lagged.advance(scene, start, command, active)
+    np.testing.assert_array_equal(after.command[:, [0, 2]], 0.0)
+    np.testing.assert_allclose(after.command[:, 1], np.where(active, STEER * (1 / 30) / (1 / 30 + 0.05), 0.0), rtol=1e-6)
+    bodies = [one.advance(scene, one.init(driving.KEY, scene), command, active) for one in (plain, none)]
+    np.testing.assert_array_equal(bodies[0].position, bodies[1].position)
