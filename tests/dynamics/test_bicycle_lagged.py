@@ -1,9 +1,12 @@
 """nuPlan's lags of the bicycle: commands act as first-order lags by implicit Euler steps, and without lags nothing changes."""
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from support import driving
+
+from scenefactory_jax.dynamics import bicycle
 
 THROTTLE, STEER, BRAKE = 0.5, 0.25, 0.0
 STEPS = np.arange(1, driving.CHUNK + 1)
@@ -30,14 +33,14 @@ def test_acceleration_and_steering_approach_their_commands(lagged):
     np.testing.assert_allclose(push, numbers["acceleration"] * throttle, atol=2e-4)
 
 
-def test_released_pedals_are_at_zero_and_no_lags_are_the_plain_bicycle():
-    scene, command = driving.scene_for(speed=5.0), jnp.array([[-1.0, STEER, -1.0]] * 8)
-    plain, none = driving.make("bicycle"), driving.make("bicycle_lagged", acceleration_lag_s=0.0, steering_lag_s=0.0)
-    lagged = driving.make("bicycle_lagged")
-    start = lagged.init(driving.KEY, scene)
+def test_released_pedals_are_at_zero_and_cars_that_have_ended_stay():
     active = jnp.arange(8) < 4
-    after = lagged.advance(scene, start, command, active)
-    np.testing.assert_array_equal(after.command[:, [0, 2]], 0.0)
-    np.testing.assert_allclose(after.command[:, 1], np.where(active, STEER * (1 / 30) / (1 / 30 + 0.05), 0.0), rtol=1e-6)
-    bodies = [one.advance(scene, one.init(driving.KEY, scene), command, active) for one in (plain, none)]
-    np.testing.assert_array_equal(bodies[0].position, bodies[1].position)
+    body, _ = driving.drive("bicycle_lagged", driving.scene_for(speed=5.0), driving.constant(-1.0, STEER, -1.0), active)
+    np.testing.assert_array_equal(body.command[:, [0, 2]], 0.0)
+    np.testing.assert_allclose(body.command[:, 1], np.where(active, STEER, 0.0), atol=1e-5)
+    assert (np.asarray(body.body.position)[4:, 0] == 0.0).all() and (np.asarray(body.body.position)[:4, 0] > 4.0).all()
+
+
+def test_without_lags_it_is_the_plain_bicycle():
+    none = driving.make("bicycle_lagged", acceleration_lag_s=0.0, steering_lag_s=0.0)
+    assert isinstance(jax.eval_shape(none.init, driving.KEY, driving.scene_for()), bicycle.Body)
