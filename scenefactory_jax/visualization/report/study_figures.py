@@ -1,6 +1,5 @@
 """Figures of a study: learning curves, rates, a matrix of variants and conditions, differences, and rates along a number."""
 
-import itertools
 import re
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -27,6 +26,7 @@ CURVES = {
 HEADLINE = ("success_rate", "clean_success_rate", "collision_rate")
 TREND = (("success_rate", "clean_success_rate"), ("collision_rate", "road_edge_rate"))  # a panel each: the scales differ
 MISSING = {"value": None, "low": None, "high": None, "count": 0, "unit": "", "method": ""}  # of a metric without a value
+SHIFT = 0.006  # of the friction, between rows
 SAME_FRICTION = 0.01  # relative difference below which two conditions have the same friction
 LIGHT = [colour for colour in COLOURS if colour != "#000000"]  # intervals are drawn in black
 
@@ -192,8 +192,8 @@ def _draw_drops(result: Result, protocol: str) -> Figure | None:
     grid = figure.subplots(len(lines), len(names), squeeze=False)
     for panels, (before, rows) in zip(grid, lines.items(), strict=True):
         for axes, name in zip(panels, names, strict=True):
-            for colour, (row, points) in zip(itertools.cycle(LIGHT), rows.items()):
-                _draw_drop(axes, [(friction[row, before], before, None), *points], name, colour=colour, label=row)
+            for place, (row, points) in enumerate(rows.items()):
+                _draw_drop(axes, [(friction[row, before], before, None), *points], name, place=place, label=row)
             axes.axhline(0, color="#222222", linewidth=1)
             axes.set(title=METRICS[name].label, xlabel="friction coefficient, mean under the agents", ylabel=f"less {before}")
             if METRICS[name].unit == FRACTION:
@@ -202,14 +202,20 @@ def _draw_drops(result: Result, protocol: str) -> Figure | None:
     return figure
 
 
-def _draw_drop(axes: Axes, points: Sequence[tuple[float, str, Mapping[str, Any] | None]], name: str, *, colour: str, label: str) -> None:
-    """One row's differences with intervals, and 0 in its first condition; conditions are named at their friction."""
+def _draw_drop(axes: Axes, points: Sequence[tuple[float, str, Mapping[str, Any] | None]], name: str, *, place: int, label: str) -> None:
+    """One row's differences with intervals, and 0 in its first condition; conditions are named at their friction.
+
+    Args:
+        place: of the row, for its colour and a shift, so that intervals stand beside each other.
+    """
     none = Estimate(0.0, 0.0, 0.0, 0, "", "")
     known = [(mu, where, none if change is None else Estimate(**change.get(name, MISSING))) for mu, where, change in points]
     known = sorted((point for point in known if point[2].value is not None), key=lambda point: point[0])
     x, (values, low, high) = [mu for mu, _, _ in known], plots.intervals([estimate for _, _, estimate in known])
-    axes.plot(x, values, color=colour, marker="o", markersize=4, label=label)
-    axes.fill_between(x, low, high, color=colour, alpha=0.13, linewidth=0)
+    x = [mu + SHIFT * place for mu in x]
+    look = {"color": LIGHT[place % len(LIGHT)], "linestyle": "--" if place >= len(LIGHT) else "-"}
+    axes.plot(x, values, **look, marker="o", markersize=4, linewidth=1, label=label)
+    axes.vlines(x, low, high, **look, linewidth=1, alpha=0.6)
     top = axes.get_xaxis_transform()
     named = {text.get_text() for text in axes.texts}
     for mu, where, _ in known:
