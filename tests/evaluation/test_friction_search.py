@@ -26,6 +26,7 @@ from scenefactory_jax.env import environment
 from scenefactory_jax.evaluation import friction_search
 from scenefactory_jax.evaluation.failure_signals import FAILURE_EVENTS
 from scenefactory_jax.evaluation.friction_search import Cover, Outcome, SearchSettings, Way
+from scenefactory_jax.learning import training_loop
 from scenefactory_jax.weather.patches import contains_points
 
 pytestmark = pytest.mark.usefixtures("quickly")
@@ -188,6 +189,11 @@ def report_of(name, metadata):
 def test_wrong_keys_are_named(words, message):
     with pytest.raises(ConfigError, match=message):
         search_friction.search_friction(hydra_config.load_config("search_friction", *words))
+
+
+def test_a_stream_that_would_leave_the_patches_out_is_refused():
+    with pytest.raises(ConfigError, match=r"weather\.patches\.scene: expected stream=none"):
+        training_loop.prepare(load_config("train", "experiment=smoke", "stream=shuffled", "weather=scene"))
 
 
 def test_patches_of_the_scene_join_other_patches():
