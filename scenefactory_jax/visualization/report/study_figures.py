@@ -213,9 +213,9 @@ def _draw_drop(axes: Axes, points: Sequence[tuple[float, str, Mapping[str, Any] 
     known = sorted((point for point in known if point[2].value is not None), key=lambda point: point[0])
     x, (values, low, high) = [mu for mu, _, _ in known], plots.intervals([estimate for _, _, estimate in known])
     x = [mu + SHIFT * place for mu in x]
-    look = {"color": LIGHT[place % len(LIGHT)], "linestyle": "--" if place >= len(LIGHT) else "-"}
-    axes.plot(x, values, **look, marker="o", markersize=4, linewidth=1, label=label)
-    axes.vlines(x, low, high, **look, linewidth=1, alpha=0.6)
+    colour, style = LIGHT[place % len(LIGHT)], "--" if place >= len(LIGHT) else "-"
+    axes.plot(x, values, color=colour, linestyle=style, marker="o", markersize=4, linewidth=1, label=label)
+    axes.vlines(x, low, high, color=colour, linewidth=1, alpha=0.6)
     top = axes.get_xaxis_transform()
     named = {text.get_text() for text in axes.texts}
     for mu, where, _ in known:
