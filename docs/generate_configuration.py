@@ -12,7 +12,7 @@ from mkdocs.structure.files import File
 
 import scenefactory_jax
 from scenefactory_jax.__main__ import COMMANDS
-from scenefactory_jax.cli import annotated_config, attack, hydra_config, scene_schema, view
+from scenefactory_jax.cli import annotated_config, attack, hydra_config, scene_schema, search_friction, view
 from scenefactory_jax.cli import schema as commands
 from scenefactory_jax.cli.annotated_config import Place
 from scenefactory_jax.core import schema
@@ -24,7 +24,8 @@ SCHEMAS = {  # of commands; those of groups follow below
     "train": commands.Train, "record": commands.Record, "evaluate": commands.Evaluate, "attack": attack.AttackConfig,
     "compare": commands.Compare,
     "export": commands.Export, "convert": scene_schema.Convert, "scenes": scene_schema.SceneOperations, "view": view.View,
-    "benchmark": commands.Benchmark, "study": commands.Study, "sysid": commands.Sysid, "physics": commands.Physics,
+    "benchmark": commands.Benchmark, "study": commands.Study, "search_friction": search_friction.SearchFriction,
+    "sysid": commands.Sysid, "physics": commands.Physics,
 }  # fmt: skip
 GROUPS = {field.name: field.type for field in dataclasses.fields(EnvConfig)} | {"scenes": ScenesConfig, "ppo": PPOConfig}
 

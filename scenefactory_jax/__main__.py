@@ -23,6 +23,7 @@ COMMANDS = {  # name -> purpose, and the keys to begin with
     "view": ("Watch episodes, or drive a car.", "run=RUN scenes.path=FOLDER out=view.html|.gif|.mp4|.png|.rrd|.xml window=true"),
     "benchmark": ("Measure steps per second.", "experiment=paper suite=throughput scenes.path=FOLDER out=FOLDER"),
     "study": ("Train, evaluate and report an experiment.", "study=navigation|transfer|... train_scenes=BANK test_scenes=BANK"),
+    "search_friction": ("Find the least water or ice that makes a policy fail.", "run=RUN|planner=pdm_closed scenes.path=BANK out=FOLDER"),
     "sysid": ("Fit the car to a reference model.", "sysid=reduced|full workers=N resume=true out=FOLDER"),
     "physics": ("Print tables of the friction model.", "weather=dry|wet|... out=FOLDER"),
 }
@@ -31,7 +32,7 @@ USAGE = "\n".join(
     [
         "usage: python -m scenefactory_jax COMMAND [key=value ...] [-m] [--help] [--cfg job]",
         "",
-        *(f"  {name:<10}{purpose}\n            {keys}" for name, (purpose, keys) in COMMANDS.items()),
+        *(f"  {name:<16}{purpose}\n{'':<18}{keys}" for name, (purpose, keys) in COMMANDS.items()),
         "",
         "COMMAND --help shows all keys of a command with their defaults; COMMAND --cfg job shows the config of your command line.",
         "RUN is a folder that `train` or `export` wrote, or the name of a bundled policy (town).",

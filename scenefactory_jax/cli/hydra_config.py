@@ -194,7 +194,7 @@ def apply_overrides(config: Mapping[str, Any], overrides: Sequence[str]) -> dict
     """Changes a run's config: `dynamics=bicycle` replaces a group of the environment, `timing.episode_s=20` one value.
 
     A run's config has no references. A key that refers to another key in `conf/` (`observations.road.kernels`) keeps its value here, and
-    a replaced group takes the values of the default environment for such keys.
+    a replaced group takes the values of the default environment for such keys. `+weather.hidden=true` adds a key that the run lacks.
 
     Raises:
         ConfigError: no such group, option or key in the run's config, with the valid ones.
@@ -202,6 +202,7 @@ def apply_overrides(config: Mapping[str, Any], overrides: Sequence[str]) -> dict
     result = copy.deepcopy(dict(config))
     for override in overrides:
         path, separator, value = override.partition("=")
+        adds, path = path.startswith("+"), path.removeprefix("+")
         *parents, last = path.split(".")
         if not separator:
             raise ConfigError(f"overrides: expected key=value, got {override!r}")
@@ -215,7 +216,8 @@ def apply_overrides(config: Mapping[str, Any], overrides: Sequence[str]) -> dict
             continue
         node: Any = result
         for depth, key in enumerate([*parents, last]):
-            if not isinstance(node, dict) or key not in node:
+            added = adds and depth == len(parents) and isinstance(node, dict)
+            if not added and (not isinstance(node, dict) or key not in node):
                 valid = ", ".join(sorted(map(str, node))) if isinstance(node, dict) else "nothing: it is a value"
                 raise ConfigError(f"overrides: {path}: the run has no {key!r} there; valid: {valid}")
             if depth == len(parents):

@@ -263,6 +263,14 @@ class StudyBaseline:
 
 
 @dataclass(frozen=True)
+class StudyPolicy:
+    """A policy that a study evaluates and does not train."""
+
+    run: str
+    overrides: list[str]
+
+
+@dataclass(frozen=True)
 class StudyTrend:
     """A quantity over which a study draws its rates."""
 
@@ -286,17 +294,20 @@ class StudyPlan:
     evaluated: dict[str, list] | None
     baselines: dict[str, StudyBaseline]
     planners: list[str]
+    policies: dict[str, StudyPolicy]
     compare: list[list[str]]
+    drops: list[list[str]]
     metrics: list[str] | None
-    figures: list[Literal["learning", "rates", "matrix", "differences", "trend"]]
+    figures: list[Literal["learning", "rates", "matrix", "differences", "drops", "trend"]]
     trend: StudyTrend | None
 
     def __post_init__(self) -> None:
         _check_seeds(self.seeds)
         if unknown := [name for name in self.metrics or [] if name not in METRICS]:
             raise ConfigError(f"metrics: expected names of {', '.join(METRICS)}, got {unknown[0]!r}")
-        if odd := [pair for pair in self.compare if len(pair) != 2]:
-            raise ConfigError(f"compare: expected pairs [before, after], got {odd[0]}")
+        for name, pairs in {"compare": self.compare, "drops": self.drops}.items():
+            if odd := [pair for pair in pairs if len(pair) != 2]:
+                raise ConfigError(f"{name}: expected pairs [before, after], got {odd[0]}")
 
 
 @dataclass(frozen=True)

@@ -248,6 +248,7 @@ def _make_evaluation(session: Session, first: Evaluation) -> Callable[[Evaluatio
         else:
             parameters = checkpoint.restore_parameters(training.folder / evaluation.weights)
         records = evaluator(parameters)
+        evaluation.file.parent.mkdir(parents=True, exist_ok=True)
         metadata = {"protocol": evaluation.protocol, "policy": evaluation.row, "condition": evaluation.condition}
         metadata |= {"config_digest": evaluation.program, "versions": run_config.versions()}
         write_records(evaluation.file, records, metadata=metadata)

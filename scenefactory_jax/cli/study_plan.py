@@ -10,11 +10,13 @@ from typing import Any, NamedTuple
 from scenefactory_jax.cli import hydra_config as configs
 from scenefactory_jax.cli import schema
 from scenefactory_jax.cli.evaluate import load_terminations
+from scenefactory_jax.core import config as run_config
 from scenefactory_jax.core import result_file
 from scenefactory_jax.core.instantiate import ConfigError
 from scenefactory_jax.data.bank import bank_index
 from scenefactory_jax.data.formats import reader_selection
 from scenefactory_jax.env import environment
+from scenefactory_jax.learning import policy_io
 
 TASK = tuple(group for group in environment.GROUPS if group != "termination")  # the termination is the protocol's
 LEARNER = (*TASK, "termination", "policy", "learner", "ppo", "devices")  # groups that the compiled training depends on
@@ -86,9 +88,15 @@ def make(config: Mapping[str, Any]) -> Plan:
         for training in trainings
         for evaluation in _plan_evaluations(config, training, protocols, is_first=training.seed == seeds[0])
     ]
-    rows, conditions = [*study["trainings"], *study["baselines"]], list(study["conditions"])
+    evaluations += [one for row in study["policies"] for one in _plan_policy(config, row, protocols)]
+    rows, conditions = list_rows(study), list(study["conditions"])
     evaluations.sort(key=lambda evaluation: (conditions.index(evaluation.condition), rows.index(evaluation.row)))
     return Plan(trainings, evaluations)
+
+
+def list_rows(study: Mapping[str, Any]) -> list[str]:
+    """Lists the rows of a study: its variants, baselines and policies."""
+    return [*study["trainings"], *study["baselines"], *study["policies"]]
 
 
 def evaluations_while_training(plan: Plan, training: Training) -> list[Evaluation]:
@@ -125,19 +133,21 @@ def check(config: Mapping[str, Any]) -> None:
     variants, conditions = list(study["trainings"]), list(study["conditions"])
     if not variants or not conditions:
         raise ConfigError("study: expected one or more trainings and conditions, got none")
-    names = {"only": (config["only"], variants), "study.evaluated": (study["evaluated"], variants)}
+    names = {"only": (config["only"], [*variants, *study["policies"]]), "study.evaluated": (study["evaluated"], variants)}
     names |= {f"study.evaluated.{name}": (chosen, conditions) for name, chosen in (study["evaluated"] or {}).items()}
     names |= {f"study.baselines.{name}.of": ([entry["of"]], variants) for name, entry in baselines.items()}
     names |= {f"study.baselines.{name}.conditions": (entry["conditions"], conditions) for name, entry in baselines.items()}
-    names |= {f"study.compare.{index}": (pair, [*variants, *baselines]) for index, pair in enumerate(study["compare"])}
+    names |= {f"study.compare.{index}": (pair, list_rows(study)) for index, pair in enumerate(study["compare"])}
+    names |= {f"study.drops.{index}": (pair, conditions) for index, pair in enumerate(study["drops"])}
     names["study.trend.values"] = ((study["trend"] or {"values": {}})["values"], variants)
     for where, (chosen, valid) in names.items():
         if unknown := [name for name in chosen or [] if name not in valid]:
             raise ConfigError(f"{where}: expected one of {', '.join(valid)}, got {unknown[0]!r}")
     if "draw" in config["parts"] and len(config["parts"]) > 1:
         raise ConfigError(f"parts: expected `draw` alone, got {config['parts']}; `report` draws, too")
-    if doubled := set(variants) & set(baselines):
-        raise ConfigError(f"study.baselines: expected names that no variant has, got {sorted(doubled)[0]!r}")
+    rows = list_rows(study)
+    if doubled := [row for row in (*baselines, *study["policies"]) if rows.count(row) > 1]:
+        raise ConfigError(f"study.baselines, study.policies: expected names that no other row has, got {doubled[0]!r}")
 
 
 def complete(config: Mapping[str, Any]) -> dict[str, Any]:
@@ -244,18 +254,52 @@ def _plan_evaluations(
             chosen = conditions if baseline["conditions"] is None else baseline["conditions"]
             rows.append((name, UNTRAINED, chosen, list(baseline["overrides"])))
     for row, weights, chosen, overrides in rows:
-        for condition in chosen:
-            judged = protocols[condition]
-            try:
-                settings = configs.apply_overrides(training.config, [*judged.overrides, *overrides])
-                schema.check_mu(settings)
-            except ConfigError as error:
-                raise ConfigError(f"study.conditions.{condition}: {error}") from None
-            for protocol, termination in judged.terminations.items():
-                program = _digest_program(config, settings, protocol, judged.scores)
-                file = training.folder / f"evaluated-{weights}-{program}.csv"
-                task = {**settings, "termination": termination}
-                yield Evaluation(row, training, weights, condition, protocol, task, judged.scores, program, file)
+        judged = {condition: protocols[condition] for condition in chosen}
+        yield from _plan_row(config, row, training, weights, judged, overrides, folder=training.folder)
+
+
+def _plan_row(
+    config: Mapping[str, Any],
+    row: str,
+    training: Training,
+    weights: str,
+    protocols: Mapping[str, ConditionProtocol],
+    overrides: Sequence[str],
+    *,
+    folder: Path,
+) -> Iterator[Evaluation]:
+    """The evaluations of one row under some conditions.
+
+    Args:
+        folder: of the records.
+    """
+    for condition, judged in protocols.items():
+        try:
+            settings = configs.apply_overrides(training.config, [*judged.overrides, *overrides])
+            schema.check_mu(settings)
+        except ConfigError as error:
+            raise ConfigError(f"study.conditions.{condition}: {error}") from None
+        for protocol, termination in judged.terminations.items():
+            program = _digest_program(config, settings, protocol, judged.scores)
+            file = folder / f"evaluated-{weights}-{program}.csv"
+            task = {**settings, "termination": termination}
+            yield Evaluation(row, training, weights, condition, protocol, task, judged.scores, program, file)
+
+
+def _plan_policy(config: Mapping[str, Any], row: str, protocols: Mapping[str, ConditionProtocol]) -> Iterator[Evaluation]:
+    """The evaluations of a policy that the study does not train, on the study's held-out scenes."""
+    entry = config["study"]["policies"][row]
+    try:
+        folder = policy_io.find(entry["run"])
+        settings = run_config.read(folder)
+    except ConfigError as error:
+        raise ConfigError(f"study.policies.{row}: {error}") from None
+    if config["test_scenes"] is None:
+        raise ConfigError(f"study.policies.{row}: expected test_scenes=PATH, as each policy has held-out scenes of its own, got null")
+    file, weights = folder / run_config.FILE, sorted(path for path in (folder / TRAINED).rglob("*") if path.is_file())
+    digest = hashlib.sha256(b"".join(path.read_bytes() for path in (file, *weights))).hexdigest()[:16]
+    given = Training(row, settings["seed"], [], settings, folder, file, digest, digest)
+    yield from _plan_row(config, row, given, TRAINED, protocols, entry["overrides"], folder=Path(config["runs"]) / f"{slug(row)}-{digest}")
 
 
 def _digest_program(config: Mapping[str, Any], settings: Mapping[str, Any], protocol: str, scores: Mapping[str, Any] | None) -> str:
@@ -263,7 +307,8 @@ def _digest_program(config: Mapping[str, Any], settings: Mapping[str, Any], prot
     path, scenes = config["test_scenes"], settings["scenes"]
     heldout = scenes["heldout"] if path is None else None  # without a path: the recipe's own held-out scenes
     parts = {name: settings[name] for name in (*TASK, "policy")} | {"protocol": protocol, "settings": evaluation}
-    parts |= {name: settings["learner"][name] for name in ACTOR if name in settings["learner"]}
+    learner = settings.get("learner", {})  # policies of before have none
+    parts |= {name: learner[name] for name in ACTOR if name in learner}
     parts |= {"scenes": digest_scenes(scenes, path), "heldout": heldout} | ({"scores": scores} if scores else {})
     return result_file.digest(parts | _digest_entry(path if heldout is None else heldout["path"]))
 

@@ -107,7 +107,7 @@ def collect(plan: Plan, config: Mapping[str, Any], records: RowRecords) -> dict[
 
     Returns:
         study: its config; scenes: names of the sources; missing: what is not trained or evaluated yet; rows: one for each row, condition
-        and protocol; differences; trainings: variant -> durations, versions and curves.
+        and protocol; differences; drops: of conditions; trainings: variant -> durations, versions and curves.
     """
     study, settings = config["study"], config["evaluation"]
     resampling = {"bootstrap": settings["bootstrap"], "seed": settings["seed"]}
@@ -119,6 +119,7 @@ def collect(plan: Plan, config: Mapping[str, Any], records: RowRecords) -> dict[
         "missing": [task.label for task in (*plan.trainings, *plan.evaluations) if not task.file.is_file()],
         "rows": [_summarise(key, runs, resampling) for key, runs in records.items() if runs],
         "differences": _compare(study["compare"], records, resampling),
+        "drops": _compare_conditions(study["drops"], records, resampling),
         "trainings": {variant: _describe_trainings(variant, plan, config["target"]) for variant in study["trainings"]},
         "made_with": {"commit": run_config.find_commit(), **run_config.versions()},
     }
@@ -129,6 +130,7 @@ def _summarise(key: RowKey, runs: statistics.Runs, resampling: Mapping[str, int]
     return {
         **dict(zip(("row", "condition", "protocol"), key, strict=True)), "seeds": list(runs), "agents": len(first["scene"]),
         "scenes": len(np.unique(first["scene"])), "agents_file": _agents_file(key),
+        "friction": float(np.mean([records["friction"].mean() for records in runs.values()])),
         "pooled": statistics.summarise_runs(runs, **resampling), "each": statistics.summarise_each_run(runs),
     }  # fmt: skip
 
@@ -146,6 +148,18 @@ def _compare(pairs: Iterable[list[str]], records: RowRecords, resampling: Mappin
             key = {"before": before, "after": after, "condition": condition, "protocol": protocol, "seeds": [len(old), len(new)]}
             differences.append({**key, "change": statistics.difference_of_runs(old, new, **resampling)})
     return differences
+
+
+def _compare_conditions(pairs: Iterable[list[str]], records: RowRecords, resampling: Mapping[str, int]) -> list[dict[str, Any]]:
+    """The differences of every pair of conditions in each row that was evaluated under both, with the same seeds."""
+    drops = []
+    for before, after in pairs:
+        for (row, condition, protocol), old in records.items():
+            new = records.get((row, after, protocol), {})
+            if condition == before and old and list(old) == list(new):
+                key = {"before": before, "after": after, "row": row, "protocol": protocol}
+                drops.append({**key, "change": statistics.difference_of_runs(old, new, **resampling)})
+    return drops
 
 
 # ---- trainings

@@ -51,6 +51,8 @@ def make(
     contact: dict[str, Any],
     friction: Callable[..., Any],
     control_dt: float,
+    acceleration_lag_s: NonNegative = 0.0,
+    steering_lag_s: NonNegative = 0.0,
 ) -> Dynamics:
     """Makes the backend: SceneFactory's bicycles (arXiv:2605.08528, section 4.4), integrated once per control step instead of four times.
 
@@ -68,6 +70,7 @@ def make(
         contact: values of `ContactLaw`.
         friction: (weather, position, speed) -> friction coefficient. It does not limit the motion: `friction_utilization` is the
             acceleration over mu g, above 1 where a real car would slide.
+        acceleration_lag_s, steering_lag_s: time constants of first-order lags of the pedals and of the steering; 0: none.
 
     Raises:
         ConfigError: a number out of range, or an unknown, missing or wrong value of `contact`, by name.
@@ -86,7 +89,37 @@ def make(
         inactive = replace(body, contact_force=jnp.zeros_like(force), friction_utilization=jnp.zeros_like(force))
         return tree_where(active, moved, inactive)
 
-    return Dynamics(init=init, advance=advance, read=functools.partial(read, height=centre_height))
+    plain = Dynamics(init=init, advance=advance, read=functools.partial(read, height=centre_height))
+    if acceleration_lag_s == 0.0 and steering_lag_s == 0.0:
+        return plain
+    return lag_commands(plain, acceleration_lag_s=acceleration_lag_s, steering_lag_s=steering_lag_s, control_dt=control_dt)
+
+
+@pytree_dataclass
+class LaggedBody:
+    """Cars of one world whose commands act with a lag."""
+
+    body: Body
+    command: Float[Array, "A 3"]  # throttle, steer and brake as they act
+
+
+def lag_commands(plain: Dynamics, *, acceleration_lag_s: float, steering_lag_s: float, control_dt: float) -> Dynamics:
+    """Makes a backend whose throttle, steer and brake follow their commands with first-order lags, as in nuPlan's kinematic bicycle.
+
+    x' = x + dt / (dt + lag) (command - x): the implicit Euler step. Acceleration is linear in the pedals, so their lag is its lag.
+    """
+    share = control_dt / (control_dt + jnp.array([acceleration_lag_s, steering_lag_s, acceleration_lag_s], jnp.float32))
+
+    def start(key: PRNGKeyArray, scene: Scene) -> LaggedBody:
+        return LaggedBody(plain.init(key, scene), jnp.zeros((len(scene.agents.yaw), 3), jnp.float32))
+
+    def advance(scene: Scene, body: LaggedBody, action: Float[Array, "A 3"], active: Bool[Array, " A"]) -> LaggedBody:
+        lowest = jnp.array([0.0, -1.0, 0.0])  # a released pedal is at 0, not below
+        command = body.command + share * (jnp.clip(action, lowest, 1.0) - body.command)
+        command = jnp.where(active[:, None], command, body.command)
+        return LaggedBody(plain.advance(scene, body.body, command, active), command)
+
+    return Dynamics(init=start, advance=advance, read=lambda body: plain.read(body.body))
 
 
 class Limits(NamedTuple):

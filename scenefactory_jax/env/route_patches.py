@@ -21,6 +21,7 @@ def route_strips(
     points: Annotated[int, Bounds(min=2)],
     surface: SurfaceName,
     film_mm: NonNegative,
+    offset_m: float = 0.0,
 ) -> Patches:
     """Makes a strip along the route of every agent; its ends are round. An agent without a route has none.
 
@@ -28,6 +29,7 @@ def route_strips(
         begin_m: where the strip begins on the route's line, from the agent's start; below 0: behind it.
         end_m: where it ends, from the agent's goal.
         points: vertices of the strip's middle line, equidistant along the route.
+        offset_m: of the middle line from the route, to the left.
     """
     agents, count = scene.agents, scene.agents.present.shape[0]
     radius = 0.5 * width_m
@@ -36,7 +38,8 @@ def route_strips(
     routed = route_following.find_routed(scene, agents)
     vertices = jnp.zeros((count, points, 2), jnp.float32)
     if scene.routes.length.shape[0]:
-        vertices, _ = route_following.find_point(scene, jnp.broadcast_to(agents.route[:, None], arc.shape), arc)
+        on_route, along = route_following.find_point(scene, jnp.broadcast_to(agents.route[:, None], arc.shape), arc)
+        vertices = on_route + offset_m * jnp.stack([-along[..., 1], along[..., 0]], axis=-1)
     return Patches(
         vertices=vertices,
         closed=jnp.zeros(count, bool),

@@ -67,7 +67,10 @@ class Run(NamedTuple):
 
 
 def prepare(config: Mapping[str, Any]) -> Prepared:
-    """Builds environment, policy and trainer of a config."""
+    """Builds environment, policy and trainer of a config; a ConfigError for one that does not fit."""
+    patches = (config["weather"].get("patches") or {}).items()
+    if config["stream"] and (read := [name for name, entry in patches if entry and entry["_target_"] == "scene_patches"]):
+        raise ConfigError(f"weather.patches.{read[0]}: expected stream=none, as streams do not read the patches of scenes, got a stream")
     env, policy, mesh = environment.make_env(config), make_policy(config), sharding.make_mesh(config["devices"])
     return Prepared(env, policy, mesh, make_trainer(config, env, policy, mesh=mesh))
 

@@ -13,6 +13,7 @@ from scenefactory_jax.core.raw_scene import SceneError
 from scenefactory_jax.core.safe_names import escape_for_terminal
 from scenefactory_jax.core.types import Scene
 from scenefactory_jax.data.loading import scene_source
+from scenefactory_jax.data.packing import road_patches
 from scenefactory_jax.data.packing.pack import Packed, prepare
 from scenefactory_jax.data.packing.stack import stack
 from scenefactory_jax.env import environment
@@ -64,6 +65,7 @@ def choose_scenes(config: Mapping[str, Any], *, count: int, skip: int) -> ShownS
         raise ConfigError(f"skip: expected 0 to {len(packed) - 1}, the number of usable scenes less one, got {skip}")
     shown, posts = zip(*packed[skip:], strict=True)
     scene, _ = stack([found.scene for found in shown], capacity=config["capacity"])
+    scene = road_patches.attach_patches(scene, [found.report for found in shown])
     return ShownScenes(scene_source.attach_grids(scene, config), tuple(escape_for_terminal(found.report.name) for found in shown), posts)
 
 

@@ -146,6 +146,11 @@ def fixed(key: PRNGKeyArray, scene: Scene, weather: Weather, *, shapes: list[Sha
     return join_patches([_make_patch(weather, shape) for shape in shapes] or [weather.patches])
 
 
+def scene_patches(key: PRNGKeyArray, scene: Scene, weather: Weather) -> Patches:
+    """Returns the patches of the scene's own weather, as packed."""
+    return scene.weather.patches
+
+
 def _make_patch(weather: Weather, shape: Shape) -> Patches:
     row = lambda value, dtype: jnp.asarray([value], dtype)  # noqa: E731
     return Patches(

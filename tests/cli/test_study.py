@@ -41,11 +41,12 @@ TOY = {
         "log replay": {"of": "all scenes", "overrides": ["dynamics=log_playback"], "conditions": ["dry"], "seeds": 1},
     },
     "compare": [["all scenes", "one scene"], ["untrained", "all scenes"]],
-    "figures": ["learning", "rates", "matrix", "differences", "trend"],
+    "drops": [["dry", "at random"]],
+    "figures": ["learning", "rates", "matrix", "differences", "drops", "trend"],
     "trend": {"label": "training scenes", "values": {"one scene": 1, "all scenes": None}},
 }
 ALONE = {"trainings": {"all scenes": []}, "conditions": {"dry": []}, "evaluated": None, "baselines": {}, "compare": [], "trend": None}
-ALONE |= {"figures": []}
+ALONE |= {"figures": [], "drops": []}
 
 
 def toy(folder, *overrides, **changes):
@@ -126,7 +127,7 @@ def test_the_report_shows_what_it_rests_on_and_no_path_of_this_machine(done):
     folder, result, _ = done
     text = (folder / "out" / "navigation.md").read_text()
     shown = re.findall(r"!\[[^\]]+\]\(([^)]+)\)", text)
-    assert len(shown) == 6 and all((folder / "out" / name).stat().st_size > 5000 for name in shown)
+    assert len(shown) == 7 and all((folder / "out" / name).stat().st_size > 5000 for name in shown)
     assert "Collision rate" in text and "Clean success rate" in text and "| all scenes | 3 | 2 (" in text
     assert str(folder) not in text and str(folder) not in (folder / "out" / "result.json").read_text()
     assert result["made_with"]["commit"] in text and result["made_with"]["jax"] == jax.__version__
@@ -212,6 +213,46 @@ def test_findings_are_those_that_holm_leaves_in_a_family():
     assert study_report.find_findings(changes, ["success_rate", "accuracy"]) == {(place, "success_rate") for place in (0, 1, 3)}
     changes[0]["change"]["success_rate"]["p"] = 0.026
     assert (0, "success_rate") not in study_report.find_findings(changes, ["success_rate"])
+
+
+def test_conditions_are_compared_within_each_row(done):
+    """On the same agents and seeds, with the friction that was measured under them; Holm's families are rows."""
+    folder, result, _ = done
+    (drop,) = result["drops"]
+    assert [drop[key] for key in ("before", "after", "row", "protocol")] == ["dry", "at random", "all scenes", "strict"]
+    rows = {row["condition"]: row for row in result["rows"] if row["row"] == "all scenes"}
+    assert rows["dry"]["friction"] > 1.0 and rows["at random"]["friction"] == pytest.approx(0.2, rel=0.02)
+    for name in ("mean_time_to_goal_s", "mean_remaining_m"):
+        values = [rows[condition]["pooled"].get(name, {}).get("value") for condition in ("dry", "at random")]
+        if None not in values:
+            assert drop["change"][name]["value"] == pytest.approx(values[1] - values[0], rel=1e-3)
+    text = (folder / "out" / "navigation.md").read_text()
+    assert "## Differences of conditions" in text and "| From | To | Row | Protocol |" in text
+    given = (("a", 0.04), ("a", 0.5), ("b", 0.04))
+    changes = [{"row": row, "protocol": "strict", "change": {"success_rate": {"p": p}}} for row, p in given]
+    assert study_report.find_findings(changes, ["success_rate"], family="row") == {(2, "success_rate")}
+
+
+def test_a_policy_by_name_is_a_row(tmp_path):
+    """Its own config and weights, under the study's conditions; its records lie among the runs, and other weights are other records."""
+    own = {"run": "drive", "overrides": ["actions.action_repeat=1", "+weather.hidden=true"]}
+    given = {"policies": {"given": own}, "conditions": {"snow": ["weather=snow", "timing=waymax"]}, "compare": [["given", "all scenes"]]}
+    entry = toy(tmp_path, "protocol=vmax", "test_scenes=test.bank", **{**ALONE, **given})
+    plan = study_plan.make(entry)
+    (one,) = [one for one in plan.evaluations if one.row == "given"]
+    assert len(plan.trainings) == 2 and one.weights == study_plan.TRAINED and (one.training.folder / one.weights).is_dir()
+    assert one.config["weather"]["hidden"] and one.config["actions"]["action_repeat"] == 1
+    assert "friction_ahead" in one.config["observations"]
+    assert one.file.parent.parent == tmp_path / "runs" and one.file.parent.name.startswith("given-") and command._is_ready(one)
+    copy = tmp_path / "copy"
+    shutil.copytree(one.training.folder, copy)
+    next(path for path in (copy / "checkpoints").rglob("*") if path.is_file()).write_bytes(b"other")
+    own["run"] = str(copy)
+    (other,) = [one for one in study_plan.make(entry).evaluations if one.row == "given"]
+    assert other.file.parent != one.file.parent
+    with pytest.raises(ConfigError, match=r"study\.conditions\.snow: overrides: weather\.hiding: the run has no 'hiding' there"):
+        own["overrides"] = ["weather.hiding=true"]
+        study_plan.make(entry)
 
 
 def test_a_condition_may_name_a_protocol(tmp_path):
@@ -359,6 +400,11 @@ def test_a_study_stops_at_its_time_limit_and_says_what_is_missing(tmp_path, caps
         ({**ALONE, "conditions": {"wet": ["weather=foggy"]}}, r"study\.conditions\.wet: .*Could not find 'weather/foggy'"),
         ({"evaluated": {"all scenes": ["drizzle"]}}, r"study\.evaluated\.all scenes: expected one of dry, at random, got 'drizzle'"),
         ({"compare": [["all scenes", "other"]]}, r"study\.compare\.0: expected one of all scenes, one scene, .*replay, got 'other'"),
+        ({"drops": [["dry", "wet"]]}, r"study\.drops\.0: expected one of dry, at random, got 'wet'"),
+        ({"drops": [["dry"]]}, r"study\.drops: expected pairs \[before, after\], got \['dry'\]"),
+        ({"policies": {"all scenes": {"run": "drive", "overrides": []}}}, r"names that no other row has, got 'all scenes'"),
+        ({"policies": {"x": {"run": "nowhere", "overrides": []}}}, r"study\.policies\.x: run: config\.yaml not found in nowhere"),
+        ({"policies": {"x": {"run": "drive", "overrides": []}}}, r"study\.policies\.x: expected test_scenes=PATH, .*got null"),
         ({"compare": [["all scenes"]]}, r"study\.compare: expected pairs \[before, after\], got \['all scenes'\]"),
         ({"colour": "red"}, r"study\.colour: unknown key; valid: base, baselines"),
         ({"protocols": ["lenient"]}, r"study\.protocols: expected one or more of goal_only, rules, strict, vmax, whole, got \['lenient'\]"),
@@ -396,7 +442,9 @@ def steps_of(config):
     return math.prod([config["iterations"], config["worlds"], config["ppo"]["horizon"], config["actions"]["action_repeat"]])
 
 
-TIMED = {"vmax": "vmax", "scenarionet": "scenarionet", "curriculum": "scenarionet", "learners": "route100"}  # study -> its protocol
+TIMED = {"vmax": "vmax", "plants": "vmax", "scenarionet": "scenarionet", "curriculum": "scenarionet"}  # study -> its protocol
+TIMED |= {"learners": "route100"}
+MANY = ("curriculum", "plants")  # environments
 TWINS = {"rewards_laptop", "network_laptop"}  # nearly the same variants as another study, for a CPU
 
 
@@ -405,7 +453,7 @@ def test_names_of_a_study_fit_each_other(name):
     study_plan.check(hydra_config.load_config("study", f"study={name}"))
 
 
-@pytest.mark.parametrize("name", [pytest.param(n, marks=[pytest.mark.slow] if n == "curriculum" else []) for n in sorted(TIMED)])
+@pytest.mark.parametrize("name", [pytest.param(n, marks=[pytest.mark.slow] if n in MANY else []) for n in sorted(TIMED)])
 def test_every_row_of_a_study_of_equal_time_builds(name, tmp_path):
     """Every learner finds its keys and its network, all judge by the study's protocol, and each row has its time."""
     entry = hydra_config.load_config("study", f"study={name}", f"runs={tmp_path}", "train_scenes=train.bank", "test_scenes=test.bank")
@@ -417,9 +465,14 @@ def test_every_row_of_a_study_of_equal_time_builds(name, tmp_path):
     for one in {one.program: one for one in plan.evaluations}.values():
         environment.make_parts(one.config)
         assert (one.scores is None) == (name == "learners")
-    kinds = {one.program: one.config["learner"].get("actor") for one in plan.evaluations if one.weights == study_plan.TRAINED}
-    assert all(one.config["learner"].get("actor") == kinds.get(one.program) for one in plan.evaluations if one.program in kinds)
+    kinds = {one.program: actor_of(one) for one in plan.evaluations if one.weights == study_plan.TRAINED}
+    assert all(actor_of(one) == kinds.get(one.program) for one in plan.evaluations if one.program in kinds)
     assert not set(entry["study"]["planners"]) - {one.row for one in plan.evaluations}
+
+
+def actor_of(evaluation):
+    """What a learner's policy is built as; policies of before have no key `learner`."""
+    return evaluation.config.get("learner", {}).get("actor")
 
 
 def entry_minutes(entry):

@@ -238,3 +238,20 @@ def test_a_missing_group_is_named(settings):
         make_policy(settings).apply({}, {"ego": jnp.zeros(7)})
     with pytest.raises(ConfigError, match=r"policy\.trackers: expected numbers for the dynamics my_car, got those of art"):
         make_policy({**settings, "dynamics": {"_target_": "my_car.make"}})
+
+
+def test_a_simulated_car_stays_within_the_friction_that_it_is_told(settings):
+    """Steered beyond it, it runs wide on the circle v^2 / limit and brakes with what is left: here nothing; in a gentle bend the rest."""
+    config = SimulationConfig(**settings["policy"]["simulation"] | {"acceleration_lag_s": 0.0, "steering_lag_s": 0.0})
+    speed, wheelbase, limit = 10.0, 2.6, 1.0
+    zero = jnp.zeros(2)
+    car = pdm_simulation.Car(jnp.zeros((2, 2)), zero, zero + speed, zero, zero)
+    steer = jnp.arctan(wheelbase * jnp.array([0.1, 0.006]))  # across: 10 and 0.6 m/s^2
+    advance = lambda most: pdm_simulation.advance(car, zero - 3.0, steer, config, wheelbase=wheelbase, limit=1.0, limit_mps2=most)  # noqa: E731
+    free, told, endless = advance(None), advance(jnp.float32(limit)), advance(jnp.float32(np.inf))
+    dt = config.dt_s
+    np.testing.assert_allclose(told.yaw, [limit / speed * dt, 0.006 * speed * dt], rtol=1e-4)
+    np.testing.assert_allclose(told.speed, [speed, speed - 0.8 * dt], rtol=1e-5)
+    np.testing.assert_allclose(free.speed, speed - 3.0 * dt, rtol=1e-6)
+    for one, other in zip(free, endless, strict=True):
+        np.testing.assert_array_equal(one, other)

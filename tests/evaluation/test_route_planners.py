@@ -12,6 +12,7 @@ from scenefactory_jax.core.schema import ConfigError
 from scenefactory_jax.core.types import LIGHT_STATES
 from scenefactory_jax.env.environment import make_env
 from scenefactory_jax.evaluation.planners import route_tracking
+from scenefactory_jax.evaluation.planners.tracker import Tracker
 from scenefactory_jax.learning.training_loop import make_policy
 
 pytestmark = pytest.mark.usefixtures("quickly")
@@ -110,3 +111,36 @@ def test_missing_groups_and_wrong_numbers_are_named(name):
         policy.apply({}, groups)
     with pytest.raises(ConfigError, match=r"policy\.trackers\.bicycle\.wheelbase_m"):
         make_policy({"policy": {**settings, "trackers": {"bicycle": {**settings["trackers"]["bicycle"], "wheelbase_m": 0.0}}}})
+
+
+def test_idm_that_is_told_the_friction_plans_within_a_part_of_it(env, scene):
+    """From rest on a free road the bound is its acceleration; on a dry road it changes nothing."""
+    observation = env.reset(jax.random.key(0), scene)[1]
+    config = apply_overrides(load_config("train", "experiment=laptop"), ["policy=idm_route", "dynamics=bicycle"])
+
+    def act(part, mu):
+        policy = make_policy(config | {"policy": config["policy"] | {"friction_part": part}})
+        seen = observation["friction_ahead"]
+        ahead = np.full(seen.shape, 1.1, np.float32)
+        ahead[:, -1] = mu
+        return np.asarray(jax.jit(lambda seen: policy.apply({}, seen)[0])(observation | {"friction_ahead": jnp.asarray(ahead)}))
+
+    np.testing.assert_allclose(act(0.7, 1.1), act(None, 1.1), atol=1e-6)
+    tracker = config["policy"]["trackers"]["bicycle"]
+    for part, mu, expected in ((None, 0.1, 1.0), (0.7, 0.1, 0.7 * 0.1 * 9.81)):
+        throttle = (expected + tracker["rolling_mps2"]) / tracker["throttle_mps2"]
+        np.testing.assert_allclose(act(part, mu)[2:4, 0], throttle, rtol=2e-3)
+
+
+def test_target_speeds_keep_to_a_limit_of_the_acceleration():
+    """v^2 = limit x radius + 2 limit x distance, where the limit is below the planner's own bounds."""
+    angle, radius, straight_m = 0.5, 20.0, 10.0
+    arc = jnp.array([[0.0, straight_m, straight_m + radius * angle]])
+    direction = jnp.array([[[1.0, 0.0], [1.0, 0.0], [np.cos(angle), np.sin(angle)]]])
+    one = jnp.ones(1)
+    route = route_tracking.RouteAhead(arc, jnp.zeros((1, 3, 2)), direction, jnp.full((1, 3), 50.0), one, 100.0 * one)
+    tracker = Tracker(**load_config("train", "policy=idm_route")["policy"]["trackers"]["bicycle"])
+    for limit in (None, jnp.array([5.0]), jnp.array([0.5])):
+        bound = 2.0 if limit is None else min(2.0, float(limit[0]))  # lateral_mps2 and braking_mps2
+        found = jax.jit(lambda most: route_tracking.compute_target_speed(route, route.limit, tracker, most))(limit)
+        assert float(found[0]) == pytest.approx(np.sqrt(bound * radius + 2 * bound * straight_m), rel=1e-3)

@@ -120,3 +120,25 @@ def test_hidden_weather_reads_a_dry_road(bend, weather, hidden):
     np.testing.assert_allclose(seen["friction_ahead"][0], np.full(7, DRY if hidden else MU), rtol=1e-3)
     np.testing.assert_array_equal(seen["weather"][0], [0.0, float(hidden), 0.0, 0.0])
     assert env.current_scene(bend, state).weather is not None and state.weather.patches.present[0]  # the road itself stays
+
+
+def test_ice_lies_under_the_left_wheels_along_the_route(bend):
+    """`weather=split_route`: the wheels roll 1 m beside the middle of a car, also in the bend and before the start."""
+    entry = load_config("task", "weather=split_route")["weather"]
+    weather = jax.jit(road_condition.make(entry))(jax.random.key(0), bend)
+    read = jax.jit(friction.make(entry["friction"]))
+    for arc in (START - 8.0, 60.0, 75.0, BEND_END + 14.0):
+        point, normal = find_place(arc)
+        places = np.float32([point + left * normal for left in (1.0, 0.5, 0.0, -1.0, 2.2)])
+        found = np.asarray(read(weather, places, np.full(5, 10.0, np.float32)))
+        np.testing.assert_allclose(found, [0.1, 0.1, DRY, DRY, DRY], rtol=0.02, err_msg=str(arc))
+
+
+def test_planners_see_the_smallest_friction_here_and_ahead(bend, weather):
+    entry = load_config("task", "observations=planning")["observations"]["planning"] | {"users": 2, "edges": 8, "lanes": 8}
+    state = replace(state_of(bend), weather=weather)
+    state = replace(state, route=replace(state.route, arc=column_of([START - 34.5, 0.0])))
+    for friction_of, expected in ((FRICTION, MU), (None, np.inf)):
+        group = observations.make({"planning": entry}, control_dt=0.1, **({"friction": friction_of} if friction_of else {}))["planning"]
+        seen = jax.jit(lambda scene, state, group=group: group(scene, state).mu)(bend, state)
+        assert float(seen[0]) == pytest.approx(expected, rel=1e-3)

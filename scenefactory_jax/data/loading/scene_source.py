@@ -21,7 +21,7 @@ from scenefactory_jax.core.types import Scene
 from scenefactory_jax.data.bank import bank_index, bank_reader, shard_files
 from scenefactory_jax.data.formats import reader_selection
 from scenefactory_jax.data.loading.scenes_config import check_config
-from scenefactory_jax.data.packing import friction_use
+from scenefactory_jax.data.packing import friction_use, road_patches
 from scenefactory_jax.data.packing.pack import Packed, PackReport, prepare
 from scenefactory_jax.data.packing.stack import describe, stack
 from scenefactory_jax.data.packing.summary import Summary, shorten_path, summarise_packed
@@ -272,6 +272,7 @@ def load_all_scenes(config: Mapping[str, Any], *, keep_raw: bool = False) -> Sce
     if not packed:
         raise ConfigError(f"scenes.path={config['path']}: no usable scene\n" + "\n".join(lines[1:]))
     scene, cuts = stack([one.scene for one in packed], capacity=config["capacity"])
+    scene = road_patches.attach_patches(scene, [one.report for one in packed])
     names = tuple(escape_for_terminal(one.report.name) for one in packed)
     scene, added = friction_use.spread_uses(scene, config["pack"].get("starts"))
     reports = tuple(one.report for one in packed) if keep_raw else ()

@@ -1,5 +1,6 @@
 """What a planner reads of each agent's surroundings: its own motion, its route, stop lines, road users, road edges and lanes."""
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import jax.numpy as jnp
@@ -10,6 +11,7 @@ from scenefactory_jax.core.schema import Count, NonNegative, Positive
 from scenefactory_jax.core.types import ROAD_USERS, YELLOW_STATES, Scene, State
 from scenefactory_jax.env import route_following, surrogate_safety
 from scenefactory_jax.env.observations.near_segments import NearSegments, gather_nearest
+from scenefactory_jax.env.observations.state_vectors import friction_ahead
 from scenefactory_jax.roadgraph import nearest_rows
 
 SPACING_M = 1.0  # between the points of the centre line
@@ -58,6 +60,7 @@ class PlanningView(NamedTuple):
     users: NearUsers
     edges: NearSegments
     lanes: NearSegments
+    mu: Float[Array, "*n"]  # smallest friction coefficient here and ahead on the route; inf where it is not observed
 
 
 def planning(
@@ -71,6 +74,8 @@ def planning(
     lanes: Count,
     range_m: Positive,
     control_dt: float,
+    friction_ahead_m: list[NonNegative] | None = None,
+    friction: Callable[..., Float[Array, "*shape"]] | None = None,
 ) -> PlanningView:
     """Observes everything that planners read; networks and adapters take no such group.
 
@@ -78,9 +83,14 @@ def planning(
         behind_m, ahead_m: length of the centre line.
         users: nearest road users that are shown.
         edges, lanes: nearest segments of road edges and of lanes that are shown, of those that reach into `range_m`.
+        friction_ahead_m: where the friction coefficient is read, beside the car's place, as in `friction_ahead`; None: nowhere.
+        friction: `weather.friction` of the config, bound; the environment supplies it.
     """
     motion = state.motion
     place = (motion.position[:, :2], motion.yaw)
+    mu = jnp.full_like(motion.yaw, jnp.inf)
+    if friction_ahead_m is not None and friction is not None:
+        mu = jnp.min(friction_ahead(scene, state, ahead_m=friction_ahead_m, friction=friction), axis=1)
     return PlanningView(
         velocity=to_frame(motion.velocity[:, :2], motion.yaw),
         yaw_rate=motion.yaw_rate,
@@ -91,6 +101,7 @@ def planning(
         users=find_users(scene, state, count=users),
         edges=gather_nearest(scene.edges, *place, count=edges, range_m=range_m),
         lanes=gather_nearest(scene.lanes, *place, count=lanes, range_m=range_m),
+        mu=mu,
     )
 
 

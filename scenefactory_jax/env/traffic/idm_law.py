@@ -6,6 +6,7 @@ a = acceleration (1 - (v / v0)^exponent - (s* / s)^2), s* = gap + max(0, v headw
 """
 
 import dataclasses
+from typing import NamedTuple
 
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
@@ -26,8 +27,24 @@ class IdmLaw:
     exponent: Positive
 
 
+class LimitedLaw(NamedTuple):
+    """The numbers of the model, with accelerations of each vehicle."""
+
+    gap_m: float
+    headway_s: float
+    acceleration_mps2: Float[Array, "*n"]
+    braking_mps2: Float[Array, "*n"]
+    exponent: float
+
+
+def limit_law(law: IdmLaw, limit_mps2: Float[Array, "*n"]) -> LimitedLaw:
+    """Limits acceleration and braking, as to a part of mu g."""
+    acceleration, braking = (jnp.minimum(value, limit_mps2) for value in (law.acceleration_mps2, law.braking_mps2))
+    return LimitedLaw(law.gap_m, law.headway_s, acceleration, braking, law.exponent)
+
+
 def compute_interaction(
-    speed: Float[Array, "*#n"], gap: Float[Array, "*#n"], leader_speed: Float[Array, "*#n"], law: IdmLaw
+    speed: Float[Array, "*#n"], gap: Float[Array, "*#n"], leader_speed: Float[Array, "*#n"], law: IdmLaw | LimitedLaw
 ) -> Float[Array, "*#n"]:
     """Computes (s* / s)^2; 0 at an infinite gap. A gap below the one at rest counts as that one, as in nuPlan."""
     approach = speed * (speed - leader_speed) / (2.0 * (law.acceleration_mps2 * law.braking_mps2) ** 0.5)
@@ -36,7 +53,7 @@ def compute_interaction(
 
 
 def compute_acceleration(
-    speed: Float[Array, "*#n"], target_speed: Float[Array, "*#n"], interaction: Float[Array, "*#n"], law: IdmLaw
+    speed: Float[Array, "*#n"], target_speed: Float[Array, "*#n"], interaction: Float[Array, "*#n"], law: IdmLaw | LimitedLaw
 ) -> Float[Array, "*#n"]:
     """Computes the acceleration; a vehicle faster than its target brakes comfortably, unless a leader demands more."""
     free = 1.0 - (speed / jnp.maximum(target_speed, SMALLEST_SPEED)) ** law.exponent
@@ -50,7 +67,7 @@ def compute_arrival(speed: Float[Array, "*#n"], distance: Float[Array, "*#n"], a
     return 2.0 * distance / (speed + jnp.sqrt(speed**2 + 2.0 * acceleration * distance) + 1e-6)
 
 
-def can_stop(speed: Float[Array, "*#n"], distance: Float[Array, "*#n"], braking: float) -> Bool[Array, "*#n"]:
+def can_stop(speed: Float[Array, "*#n"], distance: Float[Array, "*#n"], braking: float | Float[Array, "*#n"]) -> Bool[Array, "*#n"]:
     """Mask of vehicles that can stop within a distance."""
     return distance >= speed**2 / (2.0 * braking)
 

@@ -11,6 +11,7 @@ from jaxtyping import Array, Float
 from scenefactory_jax.core.geometry import heading_vector
 from scenefactory_jax.core.schema import NonNegative, Positive
 from scenefactory_jax.core.types import Policy
+from scenefactory_jax.dynamics.articulated.parameters import GRAVITY
 from scenefactory_jax.env.observations.planning import PlanningView
 from scenefactory_jax.evaluation.planners import pdm_proposals, pdm_scoring, pdm_simulation, tracker
 from scenefactory_jax.evaluation.planners.pdm_proposals import ProposalConfig
@@ -36,6 +37,7 @@ def make(
     simulation: SimulationConfig,
     scores: ScoreConfig,
     emergency: EmergencyConfig,
+    friction_part: Positive | None = None,
     dynamics: dict[str, Any] | None = None,
 ) -> Policy:
     """Plans by rules: the first step of the best of all proposals becomes the action. An agent without a route brakes.
@@ -48,6 +50,8 @@ def make(
         simulation: tracker and bicycle that follow them.
         scores: weights and bounds of the scores.
         emergency: when the best proposal is not good enough, and the car brakes straight on.
+        friction_part: of mu g at the smallest friction coefficient of the view, within which proposals are made and simulated; None: the
+            friction is not read, and the bicycle never slides.
         dynamics: of the run; supplied.
 
     Raises:
@@ -59,7 +63,8 @@ def make(
         return {}
 
     def drive(view: PlanningView) -> tuple[Array, Array]:
-        found, simulated = score_proposals(view, proposals, simulation, scores, car)
+        limit = None if friction_part is None else friction_part * GRAVITY * view.mu
+        found, simulated = score_proposals(view, proposals, simulation, scores, car, limit_mps2=limit)
         best = jnp.argmax(found.total)
         brakes = (found.collision_s[best] <= emergency.within_s) & (view.velocity[0] <= emergency.speed_mps)
         acceleration = jnp.where(brakes, -emergency.braking_mps2, simulated.acceleration[best])
@@ -79,11 +84,22 @@ def make(
 
 
 def score_proposals(
-    view: PlanningView, proposals: ProposalConfig, simulation: SimulationConfig, scores: ScoreConfig, car: Tracker
+    view: PlanningView,
+    proposals: ProposalConfig,
+    simulation: SimulationConfig,
+    scores: ScoreConfig,
+    car: Tracker,
+    *,
+    limit_mps2: Float[Array, ""] | None = None,
 ) -> tuple[Scores, Simulated]:
-    """Makes, simulates and scores the proposals of one agent."""
-    made = pdm_proposals.make_proposals(view, proposals, steps=simulation.steps + simulation.horizon + 1, dt_s=simulation.dt_s)
-    simulated = pdm_simulation.simulate(view, made, simulation, car)
+    """Makes, simulates and scores the proposals of one agent.
+
+    Args:
+        limit_mps2: of the acceleration, along and across together; None: there is none.
+    """
+    steps = simulation.steps + simulation.horizon + 1
+    made = pdm_proposals.make_proposals(view, proposals, steps=steps, dt_s=simulation.dt_s, limit_mps2=limit_mps2)
+    simulated = pdm_simulation.simulate(view, made, simulation, car, limit_mps2=limit_mps2)
     centre: Float[Array, "N T 2"] = simulated.car.position + car.rear_m * heading_vector(simulated.car.yaw)
     arc, offset = pdm_simulation.measure_line(view, made, centre)
     found = pdm_scoring.score(view, simulated.car, arc, offset, scores, rear_m=car.rear_m, dt_s=simulation.dt_s)

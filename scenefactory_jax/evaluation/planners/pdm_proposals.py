@@ -18,6 +18,7 @@ from scenefactory_jax.env.observations.planning import SPACING_M, CentreLine, Ne
 from scenefactory_jax.env.traffic import corridor, idm_law
 from scenefactory_jax.env.traffic.idm_law import IdmLaw
 
+Braking = float | Float[Array, ""]  # m/s^2
 CHORD = 2  # points of the line from which a chord is made: 0.06 m off an arc of 8 m radius
 
 
@@ -50,15 +51,23 @@ class Leaders(NamedTuple):
     speed: Float[Array, "T N K"]  # along the path, at least 0
 
 
-def make_proposals(view: PlanningView, config: ProposalConfig, *, steps: int, dt_s: float) -> Proposals:
-    """Makes all proposals of one agent over `steps` steps, the first of which is the present."""
+def make_proposals(
+    view: PlanningView, config: ProposalConfig, *, steps: int, dt_s: float, limit_mps2: Float[Array, ""] | None = None
+) -> Proposals:
+    """Makes all proposals of one agent over `steps` steps, the first of which is the present.
+
+    Args:
+        limit_mps2: of acceleration and braking; None: those of the law.
+    """
     offset = jnp.repeat(jnp.array(config.offsets_m, jnp.float32), len(config.speed_fractions))
     fraction = jnp.tile(jnp.array(config.speed_fractions, jnp.float32), len(config.offsets_m))
     leaders = find_leaders(view, offset, config, times=dt_s * config.hold_steps * jnp.arange(-(-steps // config.hold_steps)))
-    law, line = config.law, view.line
+    law, line, hardest = config.law, view.line, config.max_braking_mps2
+    if limit_mps2 is not None:
+        law, hardest = idm_law.limit_law(law, limit_mps2), jnp.minimum(hardest, limit_mps2)
     limit = jnp.where(line.limit > 0, line.limit, config.target_mps)
     front = 0.5 * view.size[0]
-    stop = find_stop_distance(view, config)
+    stop = find_stop_distance(view, comfortable=law.braking_mps2, hardest=hardest)
 
     def step(state: tuple[Array, Array], leader: Leaders) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
         arc, speed = state
@@ -116,15 +125,15 @@ def make_future_boxes(users: NearUsers, times: Float[Array, " S"]) -> Boxes:
     )
 
 
-def find_stop_distance(view: PlanningView, config: ProposalConfig) -> Float[Array, ""]:
+def find_stop_distance(view: PlanningView, *, comfortable: Braking, hardest: Braking) -> Float[Array, ""]:
     """Finds the distance of the agent's front from the nearest line that counts as a vehicle that stands; inf if there is none.
 
-    A red line that the agent could not even stop before with `max_braking_mps2` is passed, as is a yellow one before which it could not
+    A red line that the agent could not even stop before with the hardest braking is passed, as is a yellow one before which it could not
     stop comfortably.
     """
     stops, speed = view.stops, view.velocity[0]
-    stands = stops.stop_sign | (stops.red & idm_law.can_stop(speed, stops.distance, config.max_braking_mps2))
-    stands |= stops.yellow & idm_law.can_stop(speed, stops.distance, config.law.braking_mps2)
+    stands = stops.stop_sign | (stops.red & idm_law.can_stop(speed, stops.distance, hardest))
+    stands |= stops.yellow & idm_law.can_stop(speed, stops.distance, comfortable)
     return jnp.min(jnp.where(stands, stops.distance, jnp.inf), initial=jnp.inf)
 
 

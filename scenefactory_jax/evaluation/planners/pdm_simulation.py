@@ -18,6 +18,8 @@ from scenefactory_jax.evaluation.planners import pdm_proposals
 from scenefactory_jax.evaluation.planners.pdm_proposals import PathPoints, Proposals
 from scenefactory_jax.evaluation.planners.tracker import Tracker, find_largest_angle
 
+SLOW_MPS = 0.5  # slower, any friction holds the car in the sharpest bend
+
 
 @dataclasses.dataclass(frozen=True)
 class SimulationConfig:
@@ -56,8 +58,19 @@ class Simulated(NamedTuple):
     steer: Float[Array, " N"]
 
 
-def simulate(view: PlanningView, proposals: Proposals, config: SimulationConfig, tracker: Tracker) -> Simulated:
-    """Simulates all proposals of one agent; they cover the steps of the simulation and of the tracker's horizon behind it."""
+def simulate(
+    view: PlanningView,
+    proposals: Proposals,
+    config: SimulationConfig,
+    tracker: Tracker,
+    *,
+    limit_mps2: Float[Array, ""] | None = None,
+) -> Simulated:
+    """Simulates all proposals of one agent; they cover the steps of the simulation and of the tracker's horizon behind it.
+
+    Args:
+        limit_mps2: see `advance`.
+    """
     offset = proposals.offset[:, None]
     path = pdm_proposals.find_path_points(view.line, proposals.arc - tracker.rear_m, offset)
     count = len(proposals.offset)
@@ -80,7 +93,8 @@ def simulate(view: PlanningView, proposals: Proposals, config: SimulationConfig,
     def step(car: Car, at: tuple[PathPoints, Array, Array]) -> tuple[Car, tuple[Car, Array, Array]]:
         acceleration, rate = track(car, *at, config, wheelbase=tracker.wheelbase_m)
         asked = car.steer + rate * config.dt_s
-        return advance(car, acceleration, asked, config, wheelbase=tracker.wheelbase_m, limit=limit), (car, acceleration, asked)
+        numbers = {"wheelbase": tracker.wheelbase_m, "limit": limit, "limit_mps2": limit_mps2}
+        return advance(car, acceleration, asked, config, **numbers), (car, acceleration, asked)
 
     last, (cars, acceleration, asked) = jax.lax.scan(step, start, steps)
     cars = jax.tree.map(lambda leaf, end: jnp.moveaxis(jnp.concatenate([leaf, end[None]]), 0, 1), cars, last)
@@ -136,17 +150,35 @@ def solve_lateral(
 
 
 def advance(
-    car: Car, acceleration: Float[Array, " N"], steer: Float[Array, " N"], config: SimulationConfig, *, wheelbase: float, limit: float
+    car: Car,
+    acceleration: Float[Array, " N"],
+    steer: Float[Array, " N"],
+    config: SimulationConfig,
+    *,
+    wheelbase: float,
+    limit: float,
+    limit_mps2: Float[Array, ""] | None = None,
 ) -> Car:
-    """Advances the bicycle by one Euler step; acceleration and steering follow what is asked with first-order lags."""
+    """Advances the bicycle by one Euler step; acceleration and steering follow what is asked with first-order lags.
+
+    Args:
+        limit: of the steering angle, rad.
+        limit_mps2: of the acceleration: a car that is steered into a sharper bend runs wide, and what the bend leaves brakes; None: none.
+    """
     dt = config.dt_s
     push = car.acceleration + dt / (dt + config.acceleration_lag_s) * (acceleration - car.acceleration)
     turned = car.steer + dt / (dt + config.steering_lag_s) * (steer - car.steer)
     turned = jnp.clip(turned, -limit, limit)
+    curvature, driven = jnp.tan(turned) / wheelbase, push
+    if limit_mps2 is not None:
+        sharpest = limit_mps2 / jnp.maximum(car.speed, SLOW_MPS) ** 2
+        curvature = jnp.clip(curvature, -sharpest, sharpest)
+        rest = jnp.sqrt(jnp.maximum(limit_mps2**2 - (car.speed**2 * curvature) ** 2, 0.0))
+        driven = jnp.clip(push, -rest, rest)
     return Car(
         position=car.position + (car.speed * dt)[..., None] * heading_vector(car.yaw),
-        yaw=wrap_angle(car.yaw + car.speed * dt * jnp.tan(turned) / wheelbase),
-        speed=jnp.maximum(car.speed + push * dt, 0.0),
+        yaw=wrap_angle(car.yaw + car.speed * dt * curvature),
+        speed=jnp.maximum(car.speed + driven * dt, 0.0),
         acceleration=push,
         steer=turned,
     )

@@ -101,17 +101,21 @@ def compute_curvature(route: RouteAhead, speed: Float[Array, "*n"], tracker: Tra
     return jnp.where(x > 0.0, 2.0 * y / jnp.maximum(x**2 + y**2, 1.0), jnp.copysign(SHARPEST_RADPM, y))
 
 
-def compute_target_speed(route: RouteAhead, limit: Float[Array, "*n P"], tracker: Tracker) -> Float[Array, "*n"]:
+def compute_target_speed(
+    route: RouteAhead, limit: Float[Array, "*n P"], tracker: Tracker, limit_mps2: Float[Array, "*n"] | None = None
+) -> Float[Array, "*n"]:
     """Computes the largest speed with which the car can keep to the limits and to `lateral_mps2` in the bends ahead, braking with
-    `braking_mps2` before them."""
+    `braking_mps2` before them; `limit_mps2` limits both."""
+    most = jnp.full_like(route.remaining, jnp.inf) if limit_mps2 is None else limit_mps2
+    lateral, braking = (jnp.minimum(value, most)[..., None] for value in (tracker.lateral_mps2, tracker.braking_mps2))
     along = route.arc[..., 1:] - route.arc[..., :-1]
     turn = jnp.arctan2(
         cross(route.direction[..., :-1, :], route.direction[..., 1:, :]), dot(route.direction[..., :-1, :], route.direction[..., 1:, :])
     )
     curvature = jnp.where(along > SHORTEST_M, jnp.abs(turn) / jnp.maximum(along, SHORTEST_M), 0.0)
-    bend = jnp.sqrt(tracker.lateral_mps2 / jnp.maximum(curvature, GENTLEST_RADPM))
+    bend = jnp.sqrt(lateral / jnp.maximum(curvature, GENTLEST_RADPM))
     slowest = jnp.minimum(limit, jnp.concatenate([bend, bend[..., -1:]], axis=-1))  # a bend begins at the first of its two points
-    return jnp.min(jnp.sqrt(slowest**2 + 2.0 * tracker.braking_mps2 * route.arc), axis=-1)
+    return jnp.min(jnp.sqrt(slowest**2 + 2.0 * braking * route.arc), axis=-1)
 
 
 def make_action(acceleration: Float[Array, "*n"], route: RouteAhead, speed: Float[Array, "*n"], tracker: Tracker) -> Float[Array, "*n 3"]:

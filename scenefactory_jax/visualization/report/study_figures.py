@@ -25,6 +25,9 @@ CURVES = {
 }  # fmt: skip
 HEADLINE = ("success_rate", "clean_success_rate", "collision_rate")
 TREND = (("success_rate", "clean_success_rate"), ("collision_rate", "road_edge_rate"))  # a panel each: the scales differ
+MISSING = {"value": None, "low": None, "high": None, "count": 0, "unit": "", "method": ""}  # of a metric without a value
+SHIFT = 0.006  # of the friction, between rows
+SAME_FRICTION = 0.01  # relative difference below which two conditions have the same friction
 LIGHT = [colour for colour in COLOURS if colour != "#000000"]  # intervals are drawn in black
 
 
@@ -169,6 +172,58 @@ def _draw_differences(result: Result, protocol: str) -> Figure | None:
 
 
 @matplotlib.rc_context(STYLE)
+def _draw_drops(result: Result, protocol: str) -> Figure | None:
+    """Differences of conditions against the mean friction coefficient under the agents, a row of panels for each first condition.
+
+    Conditions with the friction of the first one are left out; None if none are left.
+    """
+    friction: dict[tuple[str, str], float] = {
+        (row["row"], row["condition"]): row["friction"] for row in _rows(result, protocol) if "friction" in row
+    }
+    lines: dict[str, dict[str, list[tuple[float, str, Mapping[str, Any]]]]] = {}
+    for drop in result.get("drops", []):
+        before, after = (friction.get((drop["row"], drop[end])) for end in ("before", "after"))
+        if drop["protocol"] == protocol and before and after and abs(after - before) > SAME_FRICTION * before:
+            lines.setdefault(drop["before"], {}).setdefault(drop["row"], []).append((after, drop["after"], drop["change"]))
+    if not lines:
+        return None
+    names = list_headline(result["study"])
+    figure = Figure(figsize=(4.2 * len(names), 3.4 * len(lines) + 0.6), layout="constrained")
+    grid = figure.subplots(len(lines), len(names), squeeze=False)
+    for panels, (before, rows) in zip(grid, lines.items(), strict=True):
+        for axes, name in zip(panels, names, strict=True):
+            for place, (row, points) in enumerate(rows.items()):
+                _draw_drop(axes, [(friction[row, before], before, None), *points], name, place=place, label=row)
+            axes.axhline(0, color="#222222", linewidth=1)
+            axes.set(title=METRICS[name].label, xlabel="friction coefficient, mean under the agents", ylabel=f"less {before}")
+            if METRICS[name].unit == FRACTION:
+                axes.yaxis.set_major_formatter(PercentFormatter(1.0))
+    plots.add_legend(figure, ncols=4)
+    return figure
+
+
+def _draw_drop(axes: Axes, points: Sequence[tuple[float, str, Mapping[str, Any] | None]], name: str, *, place: int, label: str) -> None:
+    """One row's differences with intervals, and 0 in its first condition; conditions are named at their friction.
+
+    Args:
+        place: of the row, for its colour and a shift, so that intervals stand beside each other.
+    """
+    none = Estimate(0.0, 0.0, 0.0, 0, "", "")
+    known = [(mu, where, none if change is None else Estimate(**change.get(name, MISSING))) for mu, where, change in points]
+    known = sorted((point for point in known if point[2].value is not None), key=lambda point: point[0])
+    x, (values, low, high) = [mu for mu, _, _ in known], plots.intervals([estimate for _, _, estimate in known])
+    x = [mu + SHIFT * place for mu in x]
+    colour, style = LIGHT[place % len(LIGHT)], "--" if place >= len(LIGHT) else "-"
+    axes.plot(x, values, color=colour, linestyle=style, marker="o", markersize=4, linewidth=1, label=label)
+    axes.vlines(x, low, high, color=colour, linewidth=1, alpha=0.6)
+    top = axes.get_xaxis_transform()
+    named = {text.get_text() for text in axes.texts}
+    for mu, where, _ in known:
+        if where not in named:
+            axes.text(mu, 0.02, where, transform=top, rotation=90, fontsize=7, color="#666666", ha="right", va="bottom")
+
+
+@matplotlib.rc_context(STYLE)
 def _draw_trend(result: Result, protocol: str) -> Figure | None:
     """Rates along a number of the variants; null stands for a variant's number of training scenes. A row of panels for each condition."""
     values, points = dict((result["study"]["trend"] or {"values": {}})["values"]), {}
@@ -211,5 +266,6 @@ _MAKERS = {
     "rates": ("Rates with 95 % intervals ({protocol})", _draw_rates),
     "matrix": ("Variants (rows) under conditions (columns), per cent ({protocol}); intervals below", _draw_matrix),
     "differences": ("Differences with 95 % intervals{points} ({protocol})", _draw_differences),
+    "drops": ("Differences of conditions against the friction coefficient, with 95 % intervals ({protocol})", _draw_drops),
     "trend": ("Rates against {label}, with 95 % intervals ({protocol})", _draw_trend),
 }

@@ -22,13 +22,14 @@ GROUPS = {"spawning": "Starts", "weather": "Weather", "traffic": "Background tra
 AS_TRAINED = "as trained"
 LABELS = {name: metric.label for name, metric in METRICS.items()}
 LABELS |= {"success_rate": "success", "clean_success_rate": "without any other event", "collision_rate": "collisions"}
-HOLM = f"\\*: below {LEVEL:g} after Holm's correction for all comparisons of the same metric, condition and protocol."
+HOLM = f"\\*: below {LEVEL:g} after Holm's correction for all comparisons of the same metric, {{family}} and protocol."
 INTERPRETATION = "interpretation.md"  # of the result; written by a person
 
 
 def write(folder: Path, result: Result) -> Path:
     """Writes `folder`/NAME.md, which includes `folder`/interpretation.md, and its figures, and returns the path of the report."""
     study, interpretation = result["study"], folder / INTERPRETATION
+    chosen = study.get("metrics")
     figures = study_figures.draw_all(result).items()
     pictures = {caption: plots.save(figure, folder / f"{name}.png") for caption, (name, figure) in figures}
     return document.write(
@@ -40,11 +41,12 @@ def write(folder: Path, result: Result) -> Path:
         _format_missing(result["missing"]),
         *(document.picture(folder, path, caption) for caption, path in pictures.items()),
         document.section("Results", *_results(result, folder)),
-        document.section("Differences", *_differences(result["differences"], study.get("metrics") or CHANGES)),
-        document.section("Each seed", document.fold("Values of each seed", _each_seed(result["rows"], study.get("metrics") or RATES))),
+        document.section("Differences", *_differences(result["differences"], chosen or CHANGES)),
+        document.section("Differences of conditions", *_differences(result.get("drops", []), chosen or CHANGES, family="row")),
+        document.section("Each seed", document.fold("Values of each seed", _each_seed(result["rows"], chosen or RATES))),
         document.section("Trainings", *_trainings(result)),
         document.section("Scenes, and how often they were evaluated", *_scenes(result)),
-        document.section("Definitions", _definitions(result["rows"], study.get("metrics") or (*RATES, *SAFETY))),
+        document.section("Definitions", _definitions(result["rows"], chosen or (*RATES, *SAFETY))),
         document.section("How to repeat it", *_settings(result)),
     )
 
@@ -107,29 +109,30 @@ def _episodes(study: Mapping[str, Any]) -> str:
     return "Episodes of each condition:\n\n" + markdown.format_table(["Condition", *GROUPS.values()], cells)
 
 
-def _differences(changes: Sequence[Mapping[str, Any]], metrics: Sequence[str]) -> list[str]:
+def _differences(changes: Sequence[Mapping[str, Any]], metrics: Sequence[str], *, family: str = "condition") -> list[str]:
+    """A table of differences within each condition, or within each row."""
     if not changes:
         return []
-    cells = [([entry[key] for key in ("before", "after", "condition", "protocol")], read_estimates(entry["change"])) for entry in changes]
+    cells = [([entry[key] for key in ("before", "after", family, "protocol")], read_estimates(entry["change"])) for entry in changes]
     intervals, without_zero = count_intervals(changes, metrics)
     has_p = any(entry["change"].get(name, {}).get("p") is not None for entry in changes for name in metrics)
     text = (
         "The second less the first, on the same scenes, cars and seeds. If all true differences were zero, about one 95 % interval in "
         f"twenty would still exclude zero: {intervals / 20:.1f} of the {intervals} in this table. {without_zero} of them do. "
-        + (HOLM if has_p else "No correction for multiple comparisons is applied.")
+        + (HOLM.format(family=family) if has_p else "No correction for multiple comparisons is applied.")
     )
-    findings = find_findings(changes, metrics)
-    return [text, tables.format_rows(["From", "To", "Condition", "Protocol"], cells, metrics, signed=True, findings=findings)]
+    findings = find_findings(changes, metrics, family=family)
+    return [text, tables.format_rows(["From", "To", family.capitalize(), "Protocol"], cells, metrics, signed=True, findings=findings)]
 
 
-def find_findings(changes: Sequence[Mapping[str, Any]], metrics: Sequence[str]) -> set[tuple[int, str]]:
+def find_findings(changes: Sequence[Mapping[str, Any]], metrics: Sequence[str], *, family: str = "condition") -> set[tuple[int, str]]:
     """Finds the differences, as (place in `changes`, metric), that are below LEVEL after Holm's correction in their family: those of the
-    same metric, condition and protocol."""
+    same metric, condition (or row) and protocol."""
     families: dict[tuple[str, ...], dict[tuple[int, str], float]] = {}
     for place, entry in enumerate(changes):
         for name in metrics:
             if (p := entry["change"].get(name, {}).get("p")) is not None:
-                families.setdefault((name, entry["condition"], entry["protocol"]), {})[place, name] = p
+                families.setdefault((name, entry[family], entry["protocol"]), {})[place, name] = p
     adjusted = [item for family in families.values() for item in statistics.adjust_holm(family).items()]
     return {key for key, p in adjusted if p < LEVEL}
 
@@ -233,6 +236,8 @@ def _settings(result: Result) -> list[str]:
     variants = [[name, code(trained["overrides"])] for name, trained in result["trainings"].items()]
     conditions = [[name, code([*study["evaluation_overrides"], *overrides])] for name, overrides in study["conditions"].items()]
     baselines = [[name, f"untrained, {entry['of']} {code(entry['overrides'])}".strip()] for name, entry in study["baselines"].items()]
+    given = study.get("policies", {}).items()
+    policies = [[name, f"{Path(entry['run']).name} {code(entry['overrides'])}".strip()] for name, entry in given]
     seeds = sorted({int(seed) for trained in result["trainings"].values() for seed in trained["runs"]})
     settings = ", ".join(f"{name} {value}" for name, value in result["settings"]["evaluation"].items())
     return [
@@ -242,5 +247,6 @@ def _settings(result: Result) -> list[str]:
         markdown.format_table(["Variant", "Overrides of `train`, beside those of where its scenes lie"], variants),
         markdown.format_table(["Condition", "Overrides of `evaluate`"], conditions),
         markdown.format_table(["Baseline", "What it is"], baselines) if baselines else "",
+        markdown.format_table(["Policy", "What it is"], policies) if policies else "",
         markdown.format_table(["The report was made with", ""], list(result["made_with"].items())),
     ]
