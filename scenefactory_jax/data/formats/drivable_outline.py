@@ -1,0 +1,54 @@
+"""Road edges from the areas on which cars drive: the outline of all of them together."""
+
+from collections.abc import Sequence
+
+import numpy as np
+import shapely
+from jaxtyping import Float
+from scipy.spatial import KDTree
+
+from scenefactory_jax.core.raw_scene import SceneError
+
+Points = Float[np.ndarray, "_ 3"]  # any number of them
+
+
+def find_edges(
+    areas: Sequence[Points], centres: Sequence[Points], cut_m: float, where: str, *, seam_m: float = 0.0, hole_m2: float = 0.0
+) -> list[Points]:
+    """The outline of all drivable areas together, without the pieces at which a lane leaves the map; heights are those of the corners.
+
+    Args:
+        areas, centres: outlines of the areas, and lines of lanes.
+        cut_m: the map was cut where an outline comes so near to a lane's centre.
+        where: file and key, for messages.
+        seam_m: narrower gaps between areas are closed.
+        hole_m2: smaller holes are closed.
+    """
+    areas = [xyz for xyz in areas if len(xyz) > 2]
+    if not areas:
+        return []
+    try:
+        area = shapely.union_all([shapely.make_valid(shapely.Polygon(xyz[:, :2])) for xyz in areas])
+        if seam_m > 0:
+            area = area.buffer(seam_m, join_style="mitre").buffer(-seam_m, join_style="mitre")
+        parts = [part for part in shapely.get_parts(area) if part.geom_type == "Polygon"]
+        parts = [shapely.Polygon(p.exterior, [hole for hole in p.interiors if shapely.Polygon(hole).area > hole_m2]) for p in parts]
+        lanes = shapely.union_all([shapely.LineString(xyz[:, :2]) for xyz in centres])
+        rings = [np.asarray(ring.coords) for ring in shapely.get_rings(parts)]
+        gaps = [np.asarray(shapely.distance(shapely.linestrings(np.stack([r[:-1], r[1:]], axis=1)), lanes)) < cut_m for r in rings]
+    except (shapely.errors.ShapelyError, ValueError) as error:
+        raise SceneError(f"{where}: no outline can be drawn around them: {error}") from error
+    pieces = [piece for ring, cut in zip(rings, gaps, strict=True) for piece in _pieces(ring, cut)]
+    corners = np.concatenate(areas)
+    tree = KDTree(corners[:, :2])
+    return [np.column_stack([piece, corners[tree.query(piece)[1], 2]]) for piece in pieces]
+
+
+def _pieces(ring: Float[np.ndarray, "N 2"], cut: np.ndarray) -> list[Float[np.ndarray, "K 2"]]:
+    """The pieces of a closed ring between the segments that are cut."""
+    if not cut.any():
+        return [ring]
+    first = int(np.flatnonzero(cut)[0])
+    points, gaps = np.roll(ring[:-1], -first - 1, axis=0), np.roll(cut, -first - 1)  # begins behind a gap and ends with it
+    starts = np.concatenate([[0], np.flatnonzero(gaps[:-1]) + 1])
+    return [points[start : stop + 1] for start, stop in zip(starts, np.flatnonzero(gaps), strict=True) if stop > start]
