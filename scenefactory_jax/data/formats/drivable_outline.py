@@ -10,6 +10,7 @@ from scipy.spatial import KDTree
 from scenefactory_jax.core.raw_scene import SceneError
 
 Points = Float[np.ndarray, "_ 3"]  # any number of them
+SIMPLIFY_M = 0.01  # maximum distance of a closed outline from what it was
 
 
 def find_edges(
@@ -30,7 +31,7 @@ def find_edges(
     try:
         area = shapely.union_all([shapely.make_valid(shapely.Polygon(xyz[:, :2])) for xyz in areas])
         if seam_m > 0:
-            area = area.buffer(seam_m, join_style="mitre").buffer(-seam_m, join_style="mitre")
+            area = area.buffer(seam_m, join_style="mitre").buffer(-seam_m, join_style="mitre").simplify(SIMPLIFY_M)
         parts = [part for part in shapely.get_parts(area) if part.geom_type == "Polygon"]
         parts = [shapely.Polygon(p.exterior, [hole for hole in p.interiors if shapely.Polygon(hole).area > hole_m2]) for p in parts]
         lanes = shapely.union_all([shapely.LineString(xyz[:, :2]) for xyz in centres])

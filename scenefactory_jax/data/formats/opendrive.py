@@ -58,6 +58,7 @@ def read(
         raise SceneError(f"{path}: expected lanes of the types {', '.join(DRIVEN)}, got none")
     junctions = {record.get("id"): record for record in document.all("junction")}
     links, opposed = opendrive_links.find_links(roads, junctions, shapes.lanes)
+    shapes = shapes._replace(lanes=opendrive_links.close_gaps(shapes.lanes, links))
     exits: dict[Key, list[Key]] = defaultdict(list)
     for lane, following in links:
         exits[lane].append(following)

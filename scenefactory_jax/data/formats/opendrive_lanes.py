@@ -21,7 +21,10 @@ DRIVEN = (
     "mwyExit",
 )  # fmt: skip
 CYCLED = "biking"
-PAVED = (*DRIVEN, CYCLED, "stop", "parking", "border", "shoulder", "restricted")
+PAVED = (*DRIVEN, CYCLED, "stop", "parking")
+STRIPS = ("border", "shoulder", "restricted")  # beside the lanes: paved where they are narrow, and else often grass
+MAX_STRIP_M = 3.0
+MIN_WIDTH_M = 1.0  # a lane begins and ends where it has that width, unless another lane leads into it or out of it
 SOLID = ("solid", "curb", "edge", "grass")  # marks that are not crossed
 MARKS = {  # type -> WOMD's white and yellow road line; the nearest that forbids as much where WOMD has none
     "broken": (6, 9), "solid": (7, 11), "solid solid": (8, 12), "solid broken": (8, 13), "broken solid": (8, 13), "broken broken": (6, 10),
@@ -29,6 +32,7 @@ MARKS = {  # type -> WOMD's white and yellow road line; the nearest that forbids
 }  # fmt: skip
 UNITS = {"m/s": 1.0, "km/h": 1 / 3.6, "mph": 1609.344 / 3600}
 NO_LIMIT = ("no limit", "undefined", "")
+CLOSE_M = 1e-4  # places that are nearer to each other are one
 INSIDE_M = 1e-9  # before the end of a section, where its own pieces still count
 Key = tuple[str, int, int]  # road, section, lane
 Line = Float[np.ndarray, "_ 3"]
@@ -44,6 +48,7 @@ class Lane:
     xyz: Line
     limit: float | None  # m/s
     span: tuple[float, float]  # of s
+    widths: tuple[float, float]  # at its begin and its end
     left: Key | None  # neighbours into which a car may change
     right: Key | None
 
@@ -104,16 +109,18 @@ class Road:
         breaks += [*self.line.start.tolist(), *self.offset.start.tolist(), *self.height.start.tolist()]
         even = np.linspace(start, end, int(np.ceil((end - start) / spacing_m)) + 1)
         s = np.unique(np.concatenate([even, [place for place in breaks if start < place < end]]))
+        s = s[np.concatenate([np.diff(s) > CLOSE_M, [True]])]
         borders = self._find_borders(widths, np.minimum(s, end - INSIDE_M), start)
         kinds = [self._find_kind(record, start) for record in records]
         lanes, lost = [], 0
         for row, (record, kind) in enumerate(zip(records, kinds, strict=True)):
             if kind is not None and record.integer("id"):
-                inner, outer = borders[record.integer("id")]
-                if np.abs(outer - inner).max() < 1e-3:
+                rows = _find_wide(record, *borders[record.integer("id")])
+                if rows is None:
                     lost += 1
                     continue
-                lanes.append(self._make_lane(index, records, kinds, row, s, (inner + outer) / 2))
+                inner, outer = (border[rows] for border in borders[record.integer("id")])
+                lanes.append(self._make_lane(index, records, kinds, row, s[rows], (inner + outer) / 2, np.abs(outer - inner)))
         marks = [mark for record in records for mark in self._find_marks(record, s, borders[record.integer("id")][1], start, end)]
         return Section(lanes, marks, self._find_areas(records, s, borders), lost)
 
@@ -145,7 +152,9 @@ class Road:
         """The record of the road's type at a place."""
         return next((entry for entry in reversed(self.types) if entry.number("s") <= start + INSIDE_M), None)
 
-    def _make_lane(self, index: int, records: list[Element], kinds: list[int | None], row: int, s: Column, t: Column) -> Lane:
+    def _make_lane(
+        self, index: int, records: list[Element], kinds: list[int | None], row: int, s: Column, t: Column, width: Column
+    ) -> Lane:
         record, kind = records[row], kinds[row]
         assert kind is not None
         forward = self._is_forward(record)
@@ -167,6 +176,7 @@ class Road:
             xyz=xyz if forward else xyz[::-1],
             limit=self._find_limit(record, self.starts[index]),
             span=(float(s[0]), float(s[-1])),
+            widths=(float(width[0]), float(width[-1]))[:: 1 if forward else -1],
             **beside,
         )
 
@@ -203,7 +213,7 @@ class Road:
             number = record.integer("id")
             if number == 0:
                 continue
-            if record.get("type", "none") in PAVED:
+            if _is_paved(record, *borders[number]):
                 runs[-1].append(borders[number][:: -1 if number > 0 else 1])  # the left border first
             elif np.ptp(borders[number], axis=0).max() > 1e-3:  # a lane without width divides nothing
                 runs.append([])
@@ -212,6 +222,22 @@ class Road:
             if run and (run[0][0] - run[-1][1]).max() > 1e-3:
                 outlines.append(np.concatenate([self.place(s, run[0][0]), self.place(s, run[-1][1])[::-1]]))
         return outlines
+
+
+def _is_paved(lane: Element, inner: Column, outer: Column) -> bool:
+    """Whether a lane is part of the area within the road edges."""
+    kind = lane.get("type", "none")
+    return kind in PAVED or (kind in STRIPS and bool(np.abs(outer - inner).max() <= MAX_STRIP_M))
+
+
+def _find_wide(lane: Element, inner: Column, outer: Column) -> slice | None:
+    """The part of a lane without ends at which it is narrow and leads nowhere; None if nothing is left."""
+    wide = np.flatnonzero(np.abs(outer - inner) >= MIN_WIDTH_M)
+    linked = [next(lane.walk("link", side), None) is not None for side in ("predecessor", "successor")]
+    if not len(wide):
+        return None
+    rows = slice(0 if linked[0] else int(wide[0]), len(inner) if linked[1] else int(wide[-1]) + 1)
+    return rows if rows.stop - rows.start > 1 else None
 
 
 def _may_change(lane: Element, other: Element, records: Sequence[Element]) -> bool:

@@ -1,14 +1,18 @@
 """Which lane of an OpenDRIVE map leads into which: links of sections, of roads, and connections of junctions (ASAM OpenDRIVE 1.8, 10 to 12)."""
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
 
-from scenefactory_jax.data.formats.opendrive_lanes import Key, Lane, Road
+from scenefactory_jax.data.formats.opendrive_lanes import CLOSE_M, Key, Lane, Line, Road
 from scenefactory_jax.data.formats.xml_content import Element
+from scenefactory_jax.data.generators.curves import smoothstep
 
 START, END = 0, 1  # of a lane or a road, along s
+MAX_SHIFT_M = 5.0  # of the end of a lane to the lane that it belongs to
+SHIFT_M = 20.0  # along a lane, over which it is shifted
 SIDES = (("predecessor", START), ("successor", END))
 
 
@@ -97,3 +101,24 @@ def _find_junction_end(road: Road, junction: str, connecting: Road, end: int) ->
 
 def _end_point(road: Road, end: int) -> np.ndarray:
     return road.line(np.array([0.0 if end == START else road.length]))[0][0]
+
+
+def close_gaps(lanes: Mapping[Key, Lane], links: Iterable[tuple[Key, Key]]) -> dict[Key, Lane]:
+    """The lanes with ends that meet: a lane that widens from nothing begins beside the lane that leads into it, and is led to its middle."""
+    moved = dict(lanes)
+    for first, second in links:
+        before, after = moved[first], moved[second]
+        gap = before.xyz[-1] - after.xyz[0]
+        if not CLOSE_M < np.hypot(*gap[:2]) < MAX_SHIFT_M:
+            continue
+        if after.widths[0] <= before.widths[1]:
+            moved[second] = replace(after, xyz=_shift(after.xyz, gap))
+        else:
+            moved[first] = replace(before, xyz=_shift(before.xyz[::-1], -gap)[::-1])
+    return moved
+
+
+def _shift(xyz: Line, gap: np.ndarray) -> Line:
+    """A line with its begin moved by `gap`, and less and less of it along the way."""
+    place = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(xyz, axis=0), axis=1))])
+    return xyz + gap * (1 - smoothstep(place / min(SHIFT_M, place[-1])))[:, None]
