@@ -8,13 +8,21 @@ from jaxtyping import Float
 from scipy.spatial import KDTree
 
 from scenefactory_jax.core.raw_scene import SceneError
+from scenefactory_jax.data.formats import polylines
 
 Points = Float[np.ndarray, "_ 3"]  # any number of them
 SIMPLIFY_M = 0.01  # maximum distance of a closed outline from what it was
 
 
 def find_edges(
-    areas: Sequence[Points], centres: Sequence[Points], cut_m: float, where: str, *, seam_m: float = 0.0, hole_m2: float = 0.0
+    areas: Sequence[Points],
+    centres: Sequence[Points],
+    cut_m: float,
+    where: str,
+    *,
+    seam_m: float = 0.0,
+    hole_m2: float = 0.0,
+    spacing_m: float = np.inf,
 ) -> list[Points]:
     """The outline of all drivable areas together, without the pieces at which a lane leaves the map; heights are those of the corners.
 
@@ -24,6 +32,7 @@ def find_edges(
         where: file and key, for messages.
         seam_m: narrower gaps between areas are closed.
         hole_m2: smaller holes are closed.
+        spacing_m: maximum between points.
     """
     areas = [xyz for xyz in areas if len(xyz) > 2]
     if not areas:
@@ -36,10 +45,11 @@ def find_edges(
         parts = [shapely.Polygon(p.exterior, [hole for hole in p.interiors if shapely.Polygon(hole).area > hole_m2]) for p in parts]
         lanes = shapely.union_all([shapely.LineString(xyz[:, :2]) for xyz in centres])
         rings = [np.asarray(ring.coords) for ring in shapely.get_rings(parts)]
-        gaps = [np.asarray(shapely.distance(shapely.linestrings(np.stack([r[:-1], r[1:]], axis=1)), lanes)) < cut_m for r in rings]
+        shapely.prepare(lanes)
+        gaps = [np.asarray(shapely.dwithin(lanes, shapely.linestrings(np.stack([r[:-1], r[1:]], axis=1)), cut_m)) for r in rings]
     except (shapely.errors.ShapelyError, ValueError) as error:
         raise SceneError(f"{where}: no outline can be drawn around them: {error}") from error
-    pieces = [piece for ring, cut in zip(rings, gaps, strict=True) for piece in _pieces(ring, cut)]
+    pieces = [polylines.densify(piece, spacing_m) for ring, cut in zip(rings, gaps, strict=True) for piece in _pieces(ring, cut)]
     corners = np.concatenate(areas)
     tree = KDTree(corners[:, :2])
     return [np.column_stack([piece, corners[tree.query(piece)[1], 2]]) for piece in pieces]

@@ -13,7 +13,7 @@ import numpy as np
 
 from scenefactory_jax.core.raw_scene import Polyline, RawScene, Reject, SceneError
 from scenefactory_jax.core.types import CROSSWALK, EDGE_BOUNDARY, STOP_SIGN
-from scenefactory_jax.data.formats import drivable_outline, opendrive_links, opendrive_signals, polylines, xml_content
+from scenefactory_jax.data.formats import drivable_outline, opendrive_links, opendrive_signals, xml_content
 from scenefactory_jax.data.formats.opendrive_lanes import DRIVEN, Key, Lane, Line, Road
 from scenefactory_jax.data.formats.xml_content import Element
 from scenefactory_jax.data.generators import map_traffic
@@ -65,9 +65,10 @@ def read(
     signals = opendrive_signals.read_signals(roads, shapes.lanes, exits)
     ids = {key: number for number, key in enumerate(shapes.lanes)}
     centres = [lane.xyz for lane in shapes.lanes.values()]
-    outlines = drivable_outline.find_edges(shapes.areas, centres, cut_m, f"{path}: lanes", seam_m=seam_m, hole_m2=hole_m2)
+    look = {"seam_m": seam_m, "hole_m2": hole_m2, "spacing_m": point_spacing_m}
+    outlines = drivable_outline.find_edges(shapes.areas, centres, cut_m, f"{path}: lanes", **look)
     crosswalks = [outline for road in roads.values() for outline in opendrive_signals.read_crosswalks(road)]
-    features = [*shapes.marks, *((EDGE_BOUNDARY, polylines.densify(xyz, point_spacing_m)) for xyz in outlines)]
+    features = [*shapes.marks, *((EDGE_BOUNDARY, xyz) for xyz in outlines)]
     features += [(CROSSWALK, outline) for outline in crosswalks]
     lines = [Polyline(kind, xyz, len(ids) + place) for place, (kind, xyz) in enumerate(features)]
     signs = [
