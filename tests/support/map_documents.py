@@ -58,3 +58,58 @@ def opendrive_document():
     junction = f'<junction id="9">{"".join(connection.format(*entry) for entry in connections)}</junction>'
     controller = '<controller id="c"><control signalId="5"/></controller>'
     return f'<?xml version="1.0"?>\n<OpenDRIVE><header revMajor="1" revMinor="7"/>{"".join(roads)}{controller}{junction}</OpenDRIVE>\n'
+
+
+def _bound(side, x0, x1, y, z=0.0):
+    points = "".join(f"<point><x>{x}</x><y>{y}</y><z>{z}</z></point>" for x in (x0, x1))
+    return f"<{side}>{points}<lineMarking>{'solid' if side == 'rightBound' else 'dashed'}</lineMarking></{side}>"
+
+
+def _lanelet(number, x0, x1, y, more="", kind="urban"):
+    """A lanelet from `x0` to `x1`, whose right border is at `y`; to the left if `x1` is smaller."""
+    side = np.sign(x1 - x0)
+    return (
+        f'<lanelet id="{number}">{_bound("leftBound", x0, x1, y + side * LANE_M)}{_bound("rightBound", x0, x1, y)}{more}'
+        f"<laneletType>{kind}</laneletType></lanelet>\n"
+    )
+
+
+def _state(tag, step, x, y, speed=None, yaw=0.0):
+    velocity = "" if speed is None else f"<velocity><exact>{speed}</exact></velocity>"
+    return (
+        f"<{tag}><position><point><x>{x}</x><y>{y}</y></point></position><orientation><exact>{yaw}</exact></orientation>"
+        f"<time><exact>{step}</exact></time>{velocity}</{tag}>\n"
+    )
+
+
+def commonroad_document(version="2020a"):
+    """Two lanes that lead to a light, one lane behind it, one against them; a car, a parked one, and a planning problem."""
+    lanelets = [
+        _lanelet(1, 0, 40, 0, '<successor ref="3"/><adjacentLeft ref="2" drivingDir="same"/><trafficSignRef ref="20"/><trafficLightRef ref="30"/>'),
+        _lanelet(2, 0, 40, LANE_M, '<adjacentRight ref="1" drivingDir="same"/><adjacentLeft ref="4" drivingDir="opposite"/>'),
+        _lanelet(3, 40, 60, 0, '<predecessor ref="1"/>'),
+        _lanelet(4, 60, 0, 3 * LANE_M, '<trafficSignRef ref="21"/>'),
+        _lanelet(5, 0, 60, -2, kind="sidewalk"),
+        _lanelet(6, 20, 24, 0, kind="crosswalk"),
+    ]
+    signs = [
+        f"<trafficSign id='{number}'><trafficSignElement><trafficSignID>{name}</trafficSignID>{value}</trafficSignElement></trafficSign>"
+        for number, name, value in ((20, "R2-1", "<additionalValue>12.5</additionalValue>"), (21, "R1-1", ""))
+    ]
+    cycle = "".join(
+        f"<cycleElement><duration>{n}</duration><color>{c}</color></cycleElement>" for n, c in ((5, "green"), (2, "yellow"), (13, "red"))
+    )
+    light = f'<trafficLight id="30"><cycle>{cycle}<timeOffset>3</timeOffset></cycle><direction>all</direction></trafficLight>'
+    crossing = '<intersection id="40"><incoming id="41"><incomingLanelet ref="1"/><successorsStraight ref="3"/></incoming></intersection>'
+    shape = "<shape><rectangle><length>4.5</length><width>1.8</width></rectangle></shape>"
+    path = "".join(_state("state", step, 2 + 0.8 * step, 1.75, 8.0) for step in range(1, 11))
+    dynamic, static = ("dynamicObstacle", "staticObstacle") if version == "2020a" else ("obstacle", "obstacle")
+    role = (lambda name: "") if version == "2020a" else (lambda name: f"<role>{name}</role>")
+    car = f"{role('dynamic')}<type>car</type>{shape}{_state('initialState', 0, 2, 1.75, 8.0)}<trajectory>{path}</trajectory>"
+    parked = f"{role('static')}<type>parkedVehicle</type>{shape}{_state('initialState', 0, 30, 1.0, yaw=0.1)}"
+    goal = "<goalState><position><lanelet ref='3'/></position><time><intervalStart>10</intervalStart><intervalEnd>14</intervalEnd></time></goalState>"
+    problem = f'<planningProblem id="60">{_state("initialState", 0, 10, 5.25, 6.0)}{goal}</planningProblem>'
+    return (
+        f'<commonRoad timeStepSize="0.1" commonRoadVersion="{version}" benchmarkID="ZAM_Street-1">\n{"".join([*lanelets, *signs])}{light}'
+        f'{crossing}<{dynamic} id="50">{car}</{dynamic}><{static} id="51">{parked}</{static}>{problem}</commonRoad>'
+    )
