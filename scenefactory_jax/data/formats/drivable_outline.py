@@ -6,6 +6,7 @@ import numpy as np
 import shapely
 from jaxtyping import Float
 from scipy.spatial import KDTree
+from shapely.geometry.polygon import orient
 
 from scenefactory_jax.core.raw_scene import SceneError
 from scenefactory_jax.data.formats import polylines
@@ -26,6 +27,8 @@ def find_edges(
 ) -> list[Points]:
     """The outline of all drivable areas together, without the pieces at which a lane leaves the map; heights are those of the corners.
 
+    What is drivable lies on the left of every edge, as in WOMD.
+
     Args:
         areas, centres: outlines of the areas, and lines of lanes.
         cut_m: the map was cut where an outline comes so near to a lane's centre.
@@ -43,6 +46,7 @@ def find_edges(
             area = area.buffer(seam_m, join_style="mitre").buffer(-seam_m, join_style="mitre").simplify(SIMPLIFY_M)
         parts = [part for part in shapely.get_parts(area) if part.geom_type == "Polygon"]
         parts = [shapely.Polygon(p.exterior, [hole for hole in p.interiors if shapely.Polygon(hole).area > hole_m2]) for p in parts]
+        parts = [orient(part) for part in parts]
         lanes = shapely.union_all([shapely.LineString(xyz[:, :2]) for xyz in centres])
         rings = [np.asarray(ring.coords) for ring in shapely.get_rings(parts)]
         shapely.prepare(lanes)
