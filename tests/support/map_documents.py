@@ -113,3 +113,39 @@ def commonroad_document(version="2020a"):
         f'<commonRoad timeStepSize="0.1" commonRoadVersion="{version}" benchmarkID="ZAM_Street-1">\n{"".join([*lanelets, *signs])}{light}'
         f'{crossing}<{dynamic} id="50">{car}</{dynamic}><{static} id="51">{parked}</{static}>{problem}</commonRoad>'
     )
+
+
+def lanelet2_document():
+    """Two lanes side by side, of which the right one leads straight on and to the right, behind a light and a stop sign; in local metres."""
+    nodes = {1: (0, 7), 2: (40, 7), 3: (0, 3.5), 4: (40, 3.5), 5: (0, 0), 6: (40, 0), 7: (80, 3.5), 8: (80, 0), 9: (60, -20), 10: (56.5, -20)}
+    nodes |= {11: (41, -2), 12: (41, -4)}
+    ways = {  # points, type, subtype
+        20: ((1, 2), "line_thin", "solid"), 21: ((4, 3), "line_thin", "dashed"), 22: ((5, 6), "curbstone", "low"), 23: ((4, 7), "virtual", ""),
+        24: ((6, 8), "virtual", ""), 25: ((4, 9), "virtual", ""), 26: ((6, 10), "virtual", ""), 27: ((11, 12), "traffic_sign", "usR1-1"),
+    }  # fmt: skip
+    lanelets = {30: (20, 21), 31: (21, 22), 32: (23, 24), 33: (25, 26)}
+    tag = lambda pairs: "".join(f'<tag k="{k}" v="{v}"/>' for k, v in pairs.items() if v)  # noqa: E731
+    text = [f'<node id="{n}" lat="0" lon="0">{tag({"local_x": str(x), "local_y": str(y), "ele": "2"})}</node>\n' for n, (x, y) in nodes.items()]
+    for number, (points, kind, subtype) in ways.items():
+        refs = "".join(f"<nd ref='{n}'/>" for n in points)
+        text.append(f'<way id="{number}">{refs}{tag({"type": kind, "subtype": subtype})}</way>\n')
+    rules = "".join(f'<member type="relation" ref="{n}" role="regulatory_element"/>' for n in (40, 42))
+    for number, (left, right) in lanelets.items():
+        sides = f'<member type="way" ref="{left}" role="left"/><member type="way" ref="{right}" role="right"/>'
+        tags = tag({"type": "lanelet", "subtype": "road", "speed_limit": "30 mph" if number == 30 else ""})
+        text.append(f'<relation id="{number}">{sides}{rules if number == 31 else ""}{tags}</relation>\n')
+    text.append(f'<relation id="40">{tag({"type": "regulatory_element", "subtype": "speed_limit", "sign_type": "50"})}</relation>')
+    sign = '<member type="way" ref="27" role="refers"/><member type="relation" ref="31" role="yield"/>'
+    text.append(f'<relation id="41">{sign}{tag({"type": "regulatory_element", "subtype": "right_of_way"})}</relation>')
+    text.append(f'<relation id="42">{tag({"type": "regulatory_element", "subtype": "traffic_light"})}</relation>')
+    return f'<?xml version="1.0"?>\n<osm version="0.6">\n{"".join(text)}</osm>\n'
+
+
+def interaction_tables(steps=25):
+    """The table of two cars, the first at 8 m/s along the right lane of `lanelet2_document`, and that of a person."""
+    head = "track_id,frame_id,timestamp_ms,agent_type,x,y,vx,vy"
+    cars = [f"{head},psi_rad,length,width"]
+    cars += [f"1,{n + 1},{100 * n + 100},car,{2 + 0.8 * n:.3f},1.75,8.0,0.0,0.0,4.5,1.8" for n in range(steps)]
+    cars += [f"2,{n + 1},{100 * n + 100},car,20.0,5.25,0.0,0.0,0.1,5.0,2.0" for n in range(steps // 2)]
+    people = [head, *(f"P1,{n + 1},{100 * n + 100},pedestrian/bicycle,45.0,{-3 - 0.1 * n:.3f},0.0,-1.0" for n in range(5, 9))]
+    return "\n".join(cars) + "\n", "\n".join(people) + "\n"

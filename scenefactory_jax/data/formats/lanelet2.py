@@ -253,17 +253,18 @@ def _find_junctions(lanelets: Mapping[int, Lanelet]) -> set[int]:
 def _find_stop_signs(
     relations: Mapping[str, Element], ways: Mapping[str, _Way], ids: Mapping[str, int], lanelets: Mapping[int, Lanelet], inside: set[int], start: int
 ) -> Iterator[Polyline]:
-    """The stop signs of rights of way, with the lanes that have to stop."""
+    """The stop signs of rights of way, with the lanes that have to stop; several elements may name one sign."""
+    governed: dict[str, dict[int, None]] = defaultdict(dict)
     for record in relations.values():
-        if _read_tags(record).get("subtype") != "right_of_way":
-            continue
-        members = [(member.get("role", ""), member.get("ref")) for member in record.all("member")]
-        posts = [ways[ref] for role, ref in members if role == "refers" and ref in ways and ways[ref].tags.get("subtype") in STOP_SIGNS]
-        yielding = [ids[ref] for role, ref in members if role == "yield" and ref in ids]
-        governed = [lane for number in yielding for lane in lanelet_map.find_junction_lanes(lanelets, number, inside)]
-        if posts and governed and len(posts[0].xyz):
-            yield Polyline(STOP_SIGN, posts[0].xyz.mean(axis=0)[None], start, lanes=tuple(dict.fromkeys(governed)))
-            start += 1
+        if _read_tags(record).get("subtype") == "right_of_way":
+            members = [(member.get("role", ""), member.get("ref")) for member in record.all("member")]
+            yielding = [ids[ref] for role, ref in members if role == "yield" and ref in ids]
+            lanes = [lane for number in yielding for lane in lanelet_map.find_junction_lanes(lanelets, number, inside)]
+            for post in (ref for role, ref in members if role == "refers" and ref in ways):
+                if ways[post].tags.get("subtype") in STOP_SIGNS and len(ways[post].xyz):
+                    governed[post] |= dict.fromkeys(lanes)
+    for place, (post, lanes) in enumerate(governed.items()):
+        yield Polyline(STOP_SIGN, ways[post].xyz.mean(axis=0)[None], start + place, lanes=tuple(lanes))
 
 
 def _find_phases(
