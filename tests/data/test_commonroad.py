@@ -13,7 +13,8 @@ from scenefactory_jax.core.types import CROSSWALK, DRIVABLE, EDGES, STOP_SIGN
 from scenefactory_jax.data.formats import reader_selection
 
 SAMPLES = {  # lanes, links, edges, lights, obstacles, steps
-    "DEU_A9-3_1_T-1": (32, 27, 4, 0, 9, 31), "USA_Peach-4_8_T-1": (79, 76, 4, 16, 9, 61), "test_reading_complex_tl": (95, 88, 9, 20, 19, 17),
+    "DEU_A9-3_1_T-1": (32, 27, 4, 0, 9, 31), "USA_Peach-4_8_T-1": (79, 76, 4, 16, 9, 61),
+    "test_reading_complex_tl": (95, 88, 9, 20, 19, 17),
 }  # fmt: skip
 
 

@@ -28,9 +28,7 @@ MAPS = {  # lanes, links, edges, lights of esmini's maps
 def readers():
     """The reader of maps alone, and the one that draws scenes on them."""
     traffic = ENTRY["traffic"] | {"scenes": 2, "traffic": ENTRY["traffic"]["traffic"] | {"cars": [2, 12]}}
-    return {
-        name: reader_selection.make({"opendrive": ENTRY | {"traffic": entry}}) for name, entry in (("map", None), ("drawn", traffic))
-    }
+    return {name: reader_selection.make({"opendrive": ENTRY | {"traffic": entry}}) for name, entry in (("map", None), ("drawn", traffic))}
 
 
 def read(path, readers):
@@ -55,7 +53,9 @@ def evaluated(shape, length, s):
     plan = xml_content.Element("planView", {}, "map.xodr: line 1: planView")
     place = {"s": "0", "x": "3", "y": "-2", "hdg": "0", "length": str(length)}
     tag, attributes = shape
-    plan.children.append(xml_content.Element("geometry", place, "g", [xml_content.Element(tag, {k: str(v) for k, v in attributes.items()}, "s")]))
+    plan.children.append(
+        xml_content.Element("geometry", place, "g", [xml_content.Element(tag, {k: str(v) for k, v in attributes.items()}, "s")])
+    )
     points, heading = read_reference_line(plan)(np.asarray(s, float))
     return points - [3, -2], heading
 
@@ -208,7 +208,9 @@ def test_real_maps_have_the_lengths_that_they_give(shared_data, readers, name):
 def test_a_map_of_scenariogeneration(tmp_path, readers):
     xodr = pytest.importorskip("scenariogeneration", reason="needs scenariogeneration").xodr
     bend = [xodr.Spiral(0.001, 0.02, 60), xodr.Arc(0.02, 40)]
-    roads = [xodr.create_road(shape, id=number, left_lanes=1, right_lanes=1) for number, shape in enumerate((bend, xodr.Line(80), xodr.Line(70)))]
+    roads = [
+        xodr.create_road(shape, id=number, left_lanes=1, right_lanes=1) for number, shape in enumerate((bend, xodr.Line(80), xodr.Line(70)))
+    ]
     junction = xodr.CommonJunctionCreator(100, "crossing")
     for road, angle in zip(roads, (0, np.pi / 2, np.pi), strict=True):
         junction.add_incoming_road_circular_geometry(road, 20, angle, "predecessor")
@@ -241,8 +243,8 @@ BOMB = '<?xml version="1.0"?>\n<!DOCTYPE OpenDRIVE [\n<!ENTITY a "aaaa">\n<!ENTI
     [
         (lambda text: BOMB, r"line 3: the entity 'a' is declared; entities are refused"),
         (lambda text: text[: len(text) // 2], r"not valid XML, damaged or cut short: .* line \d+, column \d+"),
-        (lambda text: text.replace('hdg="0"', 'hdg="north"', 1), r"line 4: road.planView.geometry: hdg: expected a finite number, got 'north'"),
-        (lambda text: text.replace("<line/>", "<circle/>", 1), r"geometry: expected one of line, arc, spiral, poly3, paramPoly3, got circle"),
+        (lambda text: text.replace('hdg="0"', 'hdg="north"', 1), r"line 4: road.planView.geometry: hdg: expected a finite number, got"),
+        (lambda text: text.replace("<line/>", "<circle/>", 1), r"geometry: expected one of line, arc, spiral, .*, got circle"),
         (lambda text: text.replace('length="60"', 'length="1e9"'), r"length: expected roads of 0 to 200000 m together"),
         (lambda text: text.replace('curvEnd="0.02"', 'curvEnd="1e9"'), r"spiral: expected a curve that turns by up to 1000 rad"),
         (lambda text: text.replace('unit="km/h"', 'unit="knots"', 1), r"unit: expected one of m/s, km/h, mph, got 'knots'"),
@@ -271,5 +273,5 @@ def test_sizes_are_bounded(tmp_path, readers):
     many = reader_selection.make({"opendrive": ENTRY | {"element_limit": 50, "traffic": None}})
     with pytest.raises(SceneError, match=r"line \d+: expected up to 50 elements \(element_limit of its reader\), got more"):
         read(written(tmp_path, opendrive_document()), many)
-    with pytest.raises(SceneError, match="unknown format|this is XML of the root element 'kml'"):
+    with pytest.raises(SceneError, match=r"this is XML of the root element 'kml'"):
         read(written(tmp_path, "<kml/>"), readers["map"])

@@ -22,7 +22,8 @@ def _road(number, start, shape, length, *, lanes, junction=-1, links="", height=
 <planView><geometry s="0" x="{x}" y="{y}" hdg="{heading}" length="{length}">{shape}</geometry></planView>
 <elevationProfile><elevation s="0" a="{height[0]}" b="{height[1]}" c="0" d="0"/></elevationProfile>
 <lanes><laneSection s="0"><left>{sides["left"]}</left>
-<center><lane id="0" type="none"><roadMark sOffset="0" type="solid" color="yellow"/></lane></center><right>{sides["right"]}</right></laneSection></lanes>
+<center><lane id="0" type="none"><roadMark sOffset="0" type="solid" color="yellow"/></lane></center>
+<right>{sides["right"]}</right></laneSection></lanes>
 {more}</road>"""
 
 
@@ -85,7 +86,13 @@ def _state(tag, step, x, y, speed=None, yaw=0.0):
 def commonroad_document(version="2020a"):
     """Two lanes that lead to a light, one lane behind it, one against them; a car, a parked one, and a planning problem."""
     lanelets = [
-        _lanelet(1, 0, 40, 0, '<successor ref="3"/><adjacentLeft ref="2" drivingDir="same"/><trafficSignRef ref="20"/><trafficLightRef ref="30"/>'),
+        _lanelet(
+            1,
+            0,
+            40,
+            0,
+            '<successor ref="3"/><adjacentLeft ref="2" drivingDir="same"/><trafficSignRef ref="20"/><trafficLightRef ref="30"/>',
+        ),
         _lanelet(2, 0, 40, LANE_M, '<adjacentRight ref="1" drivingDir="same"/><adjacentLeft ref="4" drivingDir="opposite"/>'),
         _lanelet(3, 40, 60, 0, '<predecessor ref="1"/>'),
         _lanelet(4, 60, 0, 3 * LANE_M, '<trafficSignRef ref="21"/>'),
@@ -107,7 +114,8 @@ def commonroad_document(version="2020a"):
     role = (lambda name: "") if version == "2020a" else (lambda name: f"<role>{name}</role>")
     car = f"{role('dynamic')}<type>car</type>{shape}{_state('initialState', 0, 2, 1.75, 8.0)}<trajectory>{path}</trajectory>"
     parked = f"{role('static')}<type>parkedVehicle</type>{shape}{_state('initialState', 0, 30, 1.0, yaw=0.1)}"
-    goal = "<goalState><position><lanelet ref='3'/></position><time><intervalStart>10</intervalStart><intervalEnd>14</intervalEnd></time></goalState>"
+    span = "<time><intervalStart>10</intervalStart><intervalEnd>14</intervalEnd></time>"
+    goal = f"<goalState><position><lanelet ref='3'/></position>{span}</goalState>"
     problem = f'<planningProblem id="60">{_state("initialState", 0, 10, 5.25, 6.0)}{goal}</planningProblem>'
     return (
         f'<commonRoad timeStepSize="0.1" commonRoadVersion="{version}" benchmarkID="ZAM_Street-1">\n{"".join([*lanelets, *signs])}{light}'
@@ -116,16 +124,30 @@ def commonroad_document(version="2020a"):
 
 
 def lanelet2_document():
-    """Two lanes side by side, of which the right one leads straight on and to the right, behind a light and a stop sign; in local metres."""
-    nodes = {1: (0, 7), 2: (40, 7), 3: (0, 3.5), 4: (40, 3.5), 5: (0, 0), 6: (40, 0), 7: (80, 3.5), 8: (80, 0), 9: (60, -20), 10: (56.5, -20)}
+    """Two lanes side by side, of which the right one leads on and to the right, behind a light and a stop sign; in local metres."""
+    nodes = {
+        1: (0, 7),
+        2: (40, 7),
+        3: (0, 3.5),
+        4: (40, 3.5),
+        5: (0, 0),
+        6: (40, 0),
+        7: (80, 3.5),
+        8: (80, 0),
+        9: (60, -20),
+        10: (56.5, -20),
+    }
     nodes |= {11: (41, -2), 12: (41, -4)}
     ways = {  # points, type, subtype
-        20: ((1, 2), "line_thin", "solid"), 21: ((4, 3), "line_thin", "dashed"), 22: ((5, 6), "curbstone", "low"), 23: ((4, 7), "virtual", ""),
+        20: ((1, 2), "line_thin", "solid"), 21: ((4, 3), "line_thin", "dashed"), 22: ((5, 6), "curbstone", "low"),
+        23: ((4, 7), "virtual", ""),
         24: ((6, 8), "virtual", ""), 25: ((4, 9), "virtual", ""), 26: ((6, 10), "virtual", ""), 27: ((11, 12), "traffic_sign", "usR1-1"),
     }  # fmt: skip
     lanelets = {30: (20, 21), 31: (21, 22), 32: (23, 24), 33: (25, 26)}
     tag = lambda pairs: "".join(f'<tag k="{k}" v="{v}"/>' for k, v in pairs.items() if v)  # noqa: E731
-    text = [f'<node id="{n}" lat="0" lon="0">{tag({"local_x": str(x), "local_y": str(y), "ele": "2"})}</node>\n' for n, (x, y) in nodes.items()]
+    text = [
+        f'<node id="{n}" lat="0" lon="0">{tag({"local_x": str(x), "local_y": str(y), "ele": "2"})}</node>\n' for n, (x, y) in nodes.items()
+    ]
     for number, (points, kind, subtype) in ways.items():
         refs = "".join(f"<nd ref='{n}'/>" for n in points)
         text.append(f'<way id="{number}">{refs}{tag({"type": kind, "subtype": subtype})}</way>\n')

@@ -46,8 +46,6 @@ class _Move(NamedTuple):
     planned: bool = False
 
 
-
-
 def read(
     path: Path,
     *,
@@ -78,12 +76,7 @@ def read(
     lanelets = {number: _read_lanelet(record, signs) for number, record in records.items() if not _has_type(record, UNPAVED)}
     if not any(lanelet.kind is not None for lanelet in lanelets.values()):
         raise SceneError(f"{document.where}: expected lanelets for cars, got {len(records)} others")
-    turns = {
-        ref.integer("ref"): turn
-        for incoming in document.walk("intersection", "incoming")
-        for tag, turn in TURNS.items()
-        for ref in incoming.all(tag)
-    }
+    turns = _read_turns(document)
     crossings = [record for record in records.values() if _has_type(record, ("crosswalk",))]
     features = [(CROSSWALK, np.concatenate([_bound(r, "leftBound"), _bound(r, "rightBound")[::-1]])) for r in crossings]
     roads = lanelet_map.make_roads(list(lanelets.values()), features, point_spacing_m, outline, f"{path}: lanelets")
@@ -117,6 +110,12 @@ def read(
         yield scene
     else:
         yield from map_traffic.draw(scene, (), traffic)
+
+
+def _read_turns(document: Element) -> dict[int, str]:
+    """The lanelets of junctions, with the direction in which they turn."""
+    incomings = document.walk("intersection", "incoming")
+    return {ref.integer("ref"): turn for incoming in incomings for tag, turn in TURNS.items() for ref in incoming.all(tag)}
 
 
 def _has_type(record: Element, names: tuple[str, ...]) -> bool:
@@ -218,7 +217,9 @@ def _read_plan(light: Element, step_s: float) -> tuple[str, LightPlan | None]:
     for part in parts:
         colour, span = part.need("color"), part.need("duration").value() * step_s
         if colour.text not in COLOURS or span <= 0:
-            raise SceneError(f"{part.where}: expected a colour of {', '.join(COLOURS)} for a time above 0, got {colour.text[:20]!r}, {span:g} s")
+            raise SceneError(
+                f"{part.where}: expected a colour of {', '.join(COLOURS)} for a time above 0, got {colour.text[:20]!r}, {span:g} s"
+            )
         spans.append(span)
         codes.append(LIGHT_STATES.index(COLOURS[colour.text]))
     offset = cycle.find("timeOffset")
@@ -256,7 +257,8 @@ def _read_size(shape: Element) -> tuple[float, float]:
     if first.tag == "rectangle":
         return first.need("length").value(), first.need("width").value()
     if first.tag == "circle":
-        return (2 * first.need("radius").value(),) * 2
+        diameter = 2 * first.need("radius").value()
+        return diameter, diameter
     if first.tag == "polygon" and len(first.all("point")) > 2:
         length, width = np.ptp([_point(point)[:2] for point in first.all("point")], axis=0).tolist()
         return length, width
@@ -268,7 +270,7 @@ def _read_state(record: Element, lanes: Mapping[int, Polyline]) -> tuple[int, tu
     (x, y), along = _read_place(record.need("position"), lanes)
     yaw = _read_value(record, "orientation", along)
     step = _read_value(record, "time", 0.0)
-    if not 0 <= step:
+    if not step >= 0:
         raise SceneError(f"{record.where}: time: expected a step from 0 on, got {step:g}")
     return int(step), (x, y, yaw, _read_value(record, "velocity", 0.0))
 

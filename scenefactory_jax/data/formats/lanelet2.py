@@ -1,8 +1,8 @@
 """Lanelet2 maps (`.osm`): lanelets by their two borders, regulatory elements, and positions as latitude and longitude.
 
-Links and neighbours follow from shared points and borders (Poggenhans et al., "Lanelet2: A high-definition map framework", 2018). Positions
-are projected by the transverse Mercator projection of UTM (Krüger's series, to 1 mm), relative to (0, 0) for maps around it, as INTERACTION's,
-and to the first point for others; `local_x` and `local_y` of a point go before.
+Links and neighbours follow from shared points and borders (Poggenhans et al., "Lanelet2: A high-definition map framework", 2018).
+Positions are projected by the transverse Mercator projection of UTM (Krüger's series, to 1 mm), relative to (0, 0) for maps around it, as
+INTERACTION's, and to the first point for others; `local_x` and `local_y` of a point go before.
 """
 
 import re
@@ -121,7 +121,7 @@ def _read_points(document: Element) -> tuple[dict[str, Float[np.ndarray, "3"]], 
         raise SceneError(f"{node.where}: expected degrees of latitude and longitude, got {node.get('lat')}, {node.get('lon')}")
     middle = degrees[0] * (np.abs(degrees[0]).max() > AROUND_ZERO_DEG)
     meridian = 6.0 * np.floor(middle[1] / 6.0) + 3.0
-    origin = project(*middle, meridian)
+    origin = project(middle[0], middle[1], meridian)
     plane = np.stack(project(degrees[:, 0], degrees[:, 1], meridian), axis=1) - origin
     points = {}
     for node, place in zip(nodes, plane, strict=True):
@@ -251,7 +251,12 @@ def _find_junctions(lanelets: Mapping[int, Lanelet]) -> set[int]:
 
 
 def _find_stop_signs(
-    relations: Mapping[str, Element], ways: Mapping[str, _Way], ids: Mapping[str, int], lanelets: Mapping[int, Lanelet], inside: set[int], start: int
+    relations: Mapping[str, Element],
+    ways: Mapping[str, _Way],
+    ids: Mapping[str, int],
+    lanelets: Mapping[int, Lanelet],
+    inside: set[int],
+    start: int,
 ) -> Iterator[Polyline]:
     """The stop signs of rights of way, with the lanes that have to stop; several elements may name one sign."""
     governed: dict[str, dict[int, None]] = defaultdict(dict)

@@ -75,7 +75,7 @@ def make_roads(
 
 
 def find_junction_lanes(lanelets: Mapping[int, Lanelet], start: int, inside: set[int]) -> list[int]:
-    """The lanes that a light or sign at the end of lanelet `start` governs: those of the junction behind it, or itself if it leads to none."""
+    """The lanes that a light or sign at the end of lanelet `start` governs: those of the junction behind it, or itself if there is none."""
     if start in inside:
         return [start]
     following = [number for number in lanelets[start].exit if number in lanelets]

@@ -38,7 +38,7 @@ class Profile:
 
 
 def read_profile(records: Sequence[Element], key: str = "s", offset: float = 0.0) -> Profile:
-    """Reads the pieces of a profile in the order of their starts, which `key` gives from `offset` on; of equal starts the last one counts."""
+    """Reads the pieces of a profile, whose starts `key` gives from `offset` on; of equal starts the last one counts."""
     rows = {record.number(key) + offset: [record.number(name, 0.0) for name in COEFFICIENTS] for record in records}
     starts = sorted(rows)
     return Profile(np.array(starts, float), np.array([rows[start] for start in starts], float).reshape(-1, 4))
@@ -76,7 +76,9 @@ def _read_geometry(geometry: Element) -> Callable[[Column], Frames]:
         raise SceneError(f"{geometry.where}: length: expected 0 to {MAX_STEPS * STEP_M:g} m, got {length:g}")
     shape = next((child for child in geometry.children if child.tag in SHAPES), None)
     if shape is None:
-        raise SceneError(f"{geometry.where}: expected one of {', '.join(SHAPES)}, got {', '.join(c.tag for c in geometry.children) or 'none'}")
+        raise SceneError(
+            f"{geometry.where}: expected one of {', '.join(SHAPES)}, got {', '.join(c.tag for c in geometry.children) or 'none'}"
+        )
     local = SHAPES[shape.tag](shape, length)
     turn = np.array([[np.cos(heading), np.sin(heading)], [-np.sin(heading), np.cos(heading)]])
 
@@ -91,7 +93,9 @@ def _curve(start: float, end: float, length: float, where: str) -> Callable[[Col
     """The curve whose curvature goes from `start` to `end` linearly over `length`, along +x from 0."""
     rate = (end - start) / length if length > 0 else 0.0
     if max(abs(start), abs(end)) * length > MAX_TURN:
-        raise SceneError(f"{where}: expected a curve that turns by up to {MAX_TURN:g} rad, got curvatures {start:g}, {end:g} over {length:g} m")
+        raise SceneError(
+            f"{where}: expected a curve that turns by up to {MAX_TURN:g} rad, got curvatures {start:g}, {end:g} over {length:g} m"
+        )
     turn = lambda s: s * (start + 0.5 * rate * s)  # noqa: E731
     step = min(STEP_M, 0.25 / max(abs(start), abs(end), 1e-9))
     nodes = np.linspace(0.0, length, max(1, int(np.ceil(length / max(step, length / MAX_STEPS, 1e-9)))) + 1)
@@ -152,7 +156,7 @@ def _read_param_poly3(shape: Element, length: float) -> Callable[[Column], Frame
 
 SHAPES: dict[str, Callable[[Element, float], Callable[[Column], Frames]]] = {
     "line": lambda shape, length: _curve(0.0, 0.0, length, shape.where),
-    "arc": lambda shape, length: _curve(*2 * (shape.number("curvature"),), length, shape.where),
+    "arc": lambda shape, length: _curve(shape.number("curvature"), shape.number("curvature"), length, shape.where),
     "spiral": _read_spiral,
     "poly3": _read_poly3,
     "paramPoly3": _read_param_poly3,

@@ -101,7 +101,9 @@ class Road:
         end = self.starts[index + 1] if index + 1 < len(self.starts) else self.length
         if end - start <= INSIDE_M:
             return Section([], [], [], 0)
-        records = sorted((lane for side in ("left", "center", "right") for lane in section.walk(side, "lane")), key=lambda r: -r.integer("id"))
+        records = sorted(
+            (lane for side in ("left", "center", "right") for lane in section.walk(side, "lane")), key=lambda r: -r.integer("id")
+        )
         widths = {record.integer("id"): record for record in records}
         if len(widths) != len(records) or 0 not in widths:
             raise SceneError(f"{section.where}: expected lanes with different ids, 0 among them, got {[r.get('id') for r in records]}")
@@ -176,7 +178,7 @@ class Road:
             xyz=xyz if forward else xyz[::-1],
             limit=self._find_limit(record, self.starts[index]),
             span=(float(s[0]), float(s[-1])),
-            widths=(float(width[0]), float(width[-1]))[:: 1 if forward else -1],
+            widths=(float(width[0 if forward else -1]), float(width[-1 if forward else 0])),
             **beside,
         )
 
@@ -214,7 +216,8 @@ class Road:
             if number == 0:
                 continue
             if _is_paved(record, *borders[number]):
-                runs[-1].append(borders[number][:: -1 if number > 0 else 1])  # the left border first
+                inner, outer = borders[number]
+                runs[-1].append((outer, inner) if number > 0 else (inner, outer))  # the left border first
             elif np.ptp(borders[number], axis=0).max() > 1e-3:  # a lane without width divides nothing
                 runs.append([])
         outlines = []

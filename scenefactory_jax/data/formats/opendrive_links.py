@@ -1,4 +1,4 @@
-"""Which lane of an OpenDRIVE map leads into which: links of sections, of roads, and connections of junctions (ASAM OpenDRIVE 1.8, 10 to 12)."""
+"""Links between the lanes of an OpenDRIVE map, from those of sections, roads and junctions (ASAM OpenDRIVE 1.8, 10 to 12)."""
 
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import replace
@@ -72,8 +72,9 @@ def _find_next_section(road: Road, index: int, last: int, side: str, roads: Mapp
 def _join_connections(junction: Element, roads: Mapping[str, Road]) -> Iterator[Joint]:
     """The joints of the lanes that lead into a junction with those of its connecting roads."""
     for connection in junction.all("connection"):
-        incoming, connecting = roads.get(connection.get("incomingRoad", "")), roads.get(
-            connection.get("connectingRoad", connection.get("linkedRoad", ""))
+        incoming, connecting = (
+            roads.get(connection.get("incomingRoad", "")),
+            roads.get(connection.get("connectingRoad", connection.get("linkedRoad", ""))),
         )
         if incoming is None or connecting is None:
             continue
@@ -104,7 +105,7 @@ def _end_point(road: Road, end: int) -> np.ndarray:
 
 
 def close_gaps(lanes: Mapping[Key, Lane], links: Iterable[tuple[Key, Key]]) -> dict[Key, Lane]:
-    """The lanes with ends that meet: a lane that widens from nothing begins beside the lane that leads into it, and is led to its middle."""
+    """The lanes with ends that meet: one that widens from nothing begins beside the lane that leads into it, and is led to its middle."""
     moved = dict(lanes)
     for first, second in links:
         before, after = moved[first], moved[second]

@@ -41,7 +41,9 @@ def read_signals(roads: Mapping[str, Road], lanes: Mapping[Key, Lane], exits: Ma
             if not light and kind not in STOP_SIGNS:
                 continue
             s, t = entry.number("s"), entry.number("t", 0.0)
-            governed = list(dict.fromkeys(key for lane in _find_lanes(road, entry, s, lanes) for key in _follow(lane, s, lanes, exits, roads)))
+            governed = list(
+                dict.fromkeys(key for lane in _find_lanes(road, entry, s, lanes) for key in _follow(lane, s, lanes, exits, roads))
+            )
             if governed:
                 point, heading = road.place(np.array([s]), np.array([t])), float(road.line(np.array([s]))[1][0])
                 turned = heading + (np.pi if entry.get("orientation", "none") == "-" else 0.0)

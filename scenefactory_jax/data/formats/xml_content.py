@@ -105,7 +105,9 @@ def load(path: Path, root: str, *, file_limit_mb: int, element_limit: int) -> El
             raise FormatMismatch(f"{path}: expected XML of the root element {root!r}, got {tag[:MAX_TEXT]!r}")
         line = parser.CurrentLineNumber
         if count > element_limit or len(stack) > MAX_DEPTH:
-            limit = f"{element_limit} elements (element_limit of its reader)" if count > element_limit else f"{MAX_DEPTH} elements in another"
+            limit = (
+                f"{element_limit} elements (element_limit of its reader)" if count > element_limit else f"{MAX_DEPTH} elements in another"
+            )
             raise SceneError(f"{path}: line {line}: expected up to {limit}, got more")
         above = stack[-1]
         names = f"{above.where.rpartition(': ')[2]}." if len(stack) > 2 else ""
@@ -130,5 +132,7 @@ def load(path: Path, root: str, *, file_limit_mb: int, element_limit: int) -> El
     except (expat.ExpatError, ValueError, LookupError) as error:
         if isinstance(error, SceneError):
             raise
+        if not top.children:
+            raise FormatMismatch(f"{path}: expected XML, got a file that begins with {head[:16]!r}") from error
         raise SceneError(f"{path}: not valid XML, damaged or cut short: {error}") from error
     return top.children[0]

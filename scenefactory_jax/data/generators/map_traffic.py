@@ -119,7 +119,9 @@ def _build_network(
         if part is not None:
             points, begins, ends = part
             rank = _rank_turn(points) if line.id in crossing else ON_ROAD
-            number = network.add_lane(Lane(points, width, line.speed_limit or limit, rank, line.kind, stops.get(line.id) if begins else None))
+            number = network.add_lane(
+                Lane(points, width, line.speed_limit or limit, rank, line.kind, stops.get(line.id) if begins else None)
+            )
             kept[line.id] = number, begins, ends, line
     for number, _, ends, line in kept.values():
         for follower in line.exit if ends else ():
