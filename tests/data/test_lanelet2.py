@@ -107,7 +107,7 @@ def test_a_real_recording(shared_data, readers):
     near = KDTree(np.concatenate([line.xyz[:, :2] for line in lanes]))
     places = np.concatenate([track.xyz[track.valid][:, :2] for raw in scenes for track in raw.tracks])
     assert (
-        len(places) == len(table.read_text().splitlines()) - 1 and np.median(near.query(places)[0]) < 0.6
+        len(places) == len(table.read_text().splitlines()) - 1 and np.median(near.query(places)[0]) < 0.8  # cars in turns leave the centre
     )  # recording and map are in the same coordinates
 
 
