@@ -14,10 +14,11 @@ from typing import Any, NamedTuple
 import numpy as np
 import shapely
 from jaxtyping import Float
+from scipy.spatial import KDTree
 
 from scenefactory_jax.core.raw_scene import Companion, Polyline, RawScene, Reject, SceneError
-from scenefactory_jax.core.types import CROSSWALK, LANE_BIKE, LANE_FREEWAY, LANE_STREET, STOP_SIGN
-from scenefactory_jax.data.formats import lanelet_map, xml_content
+from scenefactory_jax.core.types import CROSSWALK, EDGE_BOUNDARY, LANE_BIKE, LANE_FREEWAY, LANE_STREET, STOP_SIGN
+from scenefactory_jax.data.formats import lanelet_map, polylines, xml_content
 from scenefactory_jax.data.formats.drivable_outline import Points
 from scenefactory_jax.data.formats.lanelet_map import Lanelet, OutlineNumbers
 from scenefactory_jax.data.formats.opendrive_signals import Signal, group_lights
@@ -30,6 +31,7 @@ UNPAVED = ("walkway", "stairs", "crosswalk", "shared_walkway")
 MARKS = {  # subtype of a line -> WOMD's white and yellow road line
     "dashed": (6, 9), "solid": (7, 11), "solid_solid": (8, 12), "dashed_solid": (8, 13), "solid_dashed": (8, 13)
 }  # fmt: skip
+PHYSICAL = ("curbstone", "road_border", "guard_rail", "wall", "fence", "jersey_barrier")  # lines that bound the road
 LINES = ("line_thin", "line_thick")
 STOP_SIGNS = ("usR1-1", "de206")
 LIMIT = re.compile(r"([\d.]+)\s*(mph|km/h|kmh|m/s|mps)?")
@@ -101,7 +103,14 @@ def read_map(path: Path, *, point_spacing_m: float, outline: OutlineNumbers, ele
     ids = {number: place for place, number in enumerate(shapes)}
     lanelets = _make_lanelets(shapes, ids, relations)
     inside = _find_junctions(lanelets)
-    roads = lanelet_map.make_roads(list(lanelets.values()), crossings, point_spacing_m, outline, f"{path}: lanelets")
+    bounds = {frozenset(way.ids) for borders in shapes.values() for way in borders}
+    lines = [way for way in ways.values() if len(way.ids) > 1]
+    physical = any(way.tags.get("type") in PHYSICAL for way in lines)  # a map that has kerbs has edges at them alone
+    unbounded = [way.xyz for way in lines if way.tags.get("type") not in PHYSICAL] if physical else []
+    kerbs = [way.xyz for way in lines if way.tags.get("type") in PHYSICAL and frozenset(way.ids) not in bounds]
+    edges = [(EDGE_BOUNDARY, xyz) for xyz in _turn_to_road(kerbs, lanelets, point_spacing_m)]
+    where = f"{path}: lanelets"
+    roads = lanelet_map.make_roads(list(lanelets.values()), [*crossings, *edges], point_spacing_m, outline, where, unbounded)
     signs = _find_stop_signs(relations, ways, ids, lanelets, inside, max(line.id for line in roads) + 1)
     return Map((*roads, *signs), _find_phases(relations, ids, lanelets, inside), sorted(inside), origin)
 
@@ -183,6 +192,17 @@ def _join(parts: list[_Way]) -> _Way:
         part = part if part.ids[0] == line.ids[-1] else _turn(part)
         line = _Way(line.ids + part.ids[1:], np.concatenate([line.xyz, part.xyz[1:]]), line.tags)
     return line
+
+
+def _turn_to_road(lines: list[Points], lanelets: Mapping[int, Lanelet], spacing_m: float) -> list[Points]:
+    """Lines with the nearest lanelet on their left."""
+    tree = KDTree(np.concatenate([(np.concatenate([p.left, p.right]))[:, :2] for p in lanelets.values()]))
+    turned = []
+    for line in (polylines.densify(line, spacing_m) for line in lines):
+        offset = tree.data[tree.query(line[:-1, :2])[1]] - line[:-1, :2]
+        along = np.diff(line[:, :2], axis=0)
+        turned.append(line if np.sum(along[:, 0] * offset[:, 1] - along[:, 1] * offset[:, 0]) >= 0 else line[::-1])
+    return turned
 
 
 def _make_lanelets(shapes: Mapping[str, tuple[_Way, _Way]], ids: Mapping[str, int], relations: Mapping[str, Element]) -> dict[int, Lanelet]:

@@ -38,12 +38,18 @@ class OutlineNumbers:
 
 
 def make_roads(
-    lanelets: Sequence[Lanelet], features: Sequence[tuple[int, Points]], spacing_m: float, outline: OutlineNumbers, where: str
+    lanelets: Sequence[Lanelet],
+    features: Sequence[tuple[int, Points]],
+    spacing_m: float,
+    outline: OutlineNumbers,
+    where: str,
+    unbounded: Sequence[Points] = (),
 ) -> tuple[Polyline, ...]:
     """Lanes, which keep their ids, then painted lines (each once), edges, and other features: (kind, points).
 
     Args:
         spacing_m: maximum between the points of lanes and lines.
+        unbounded: borders beside which the road goes on.
     """
     lanes = {lanelet.id: lanelet for lanelet in lanelets if lanelet.kind is not None}
     centres = {number: centre(lanelet.left, lanelet.right, spacing_m) for number, lanelet in lanes.items()}
@@ -53,7 +59,7 @@ def make_roads(
         rows = tuple(map(tuple, points.tolist()))
         marks.setdefault(min(rows, rows[::-1]), (kind, polylines.densify(points, spacing_m)))
     edges = drivable_outline.find_edges(
-        areas, list(centres.values()), outline.cut_m, where, seam_m=outline.seam_m, hole_m2=outline.hole_m2, spacing_m=spacing_m
+        areas, [*centres.values(), *unbounded], outline.cut_m, where, seam_m=outline.seam_m, hole_m2=outline.hole_m2, spacing_m=spacing_m
     )
     keep = lambda ids: tuple(dict.fromkeys(number for number in ids if number in lanes))  # noqa: E731
     roads = [

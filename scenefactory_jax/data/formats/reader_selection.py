@@ -12,7 +12,8 @@ from scenefactory_jax.core.instantiate import instantiate
 from scenefactory_jax.core.raw_scene import FormatMismatch, OtherContent, RawScene, Reject, SceneError
 from scenefactory_jax.data.formats import file_content
 
-MAX_REASON = 72  # characters of a reader's refusal
+MAX_REASON = 80  # characters of a reader's refusal
+MAX_REFUSALS = 2  # that are named
 BANK_INDEX = "bank.json"  # the file that makes a folder a bank
 HEAD = 16_384  # bytes that identify formats without a reader: SUMO's networks begin with a comment of some thousand
 STARTS = {
@@ -126,4 +127,4 @@ def _explain(path: Path, refusals: Sequence[str]) -> str:
         name = ROOTS.get(root[1], f"XML of the root element {root[1][:40]!r}")
     if name is not None:
         return f"this is {name}: it is not read"
-    return f"unknown format: {'; '.join(refusals) or f'it begins with {head[:16]!r}'}"
+    return f"unknown format: {'; '.join(refusals[:MAX_REFUSALS]) or f'it begins with {head[:16]!r}'}"
