@@ -13,7 +13,6 @@ from scenefactory_jax.core.raw_scene import FormatMismatch, OtherContent, RawSce
 from scenefactory_jax.data.formats import file_content
 
 MAX_REASON = 80  # characters of a reader's refusal
-MAX_REFUSALS = 2  # that are named
 BANK_INDEX = "bank.json"  # the file that makes a folder a bank
 HEAD = 16_384  # bytes that identify formats without a reader: SUMO's networks begin with a comment of some thousand
 STARTS = {
@@ -98,20 +97,21 @@ def read(path: Path | str, formats: Mapping[str, Reader]) -> Iterator[RawScene |
 
 def _find_reader(path: Path, formats: Mapping[str, Reader]) -> tuple[RawScene | Reject, Iterator[RawScene | Reject]]:
     """The first scene of the first reader that accepts the file, and the iterator over the others."""
-    refusals: list[str] = []
+    refusals: dict[str, str] = {}
     for name, reader in formats.items():
         scenes = iter(reader(path))
         try:
             first = next(scenes, None)
         except OtherContent as refusal:
-            refusals.append(textwrap.shorten(f"{name}: {str(refusal).removeprefix(f'{path}: ')}", MAX_REASON))
+            refusals[name] = textwrap.shorten(f"{name}: {str(refusal).removeprefix(f'{path}: ')}", MAX_REASON)
             continue
         except FormatMismatch:
             continue
         if first is None:
             raise SceneError(f"{path}: the reader {name!r} found no scene")
         return first, scenes
-    raise SceneError(f"{path}: {_explain(path, refusals)}; formats: {', '.join(formats) or 'none'}")
+    others = [name for name in formats if name not in refusals]
+    raise SceneError(f"{path}: {_explain(path, list(refusals.values()))}; formats: {', '.join(others) or 'none'}")
 
 
 def _explain(path: Path, refusals: Sequence[str]) -> str:
@@ -127,4 +127,4 @@ def _explain(path: Path, refusals: Sequence[str]) -> str:
         name = ROOTS.get(root[1], f"XML of the root element {root[1][:40]!r}")
     if name is not None:
         return f"this is {name}: it is not read"
-    return f"unknown format: {'; '.join(refusals[:MAX_REFUSALS]) or f'it begins with {head[:16]!r}'}"
+    return f"unknown format: {'; '.join(refusals) or f'it begins with {head[:16]!r}'}"
