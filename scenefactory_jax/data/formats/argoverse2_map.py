@@ -16,6 +16,7 @@ from jaxtyping import Float
 from scenefactory_jax.core.raw_scene import Polyline, SceneError
 from scenefactory_jax.core.types import CROSSWALK, EDGE_BOUNDARY, LANE_BIKE, LANE_STREET
 from scenefactory_jax.data.formats import drivable_outline, file_content, polylines, values
+from scenefactory_jax.data.formats.drivable_outline import OutlineNumbers
 from scenefactory_jax.data.formats.values import AXES, Node
 
 SECTIONS = ("lane_segments", "drivable_areas", "pedestrian_crossings")
@@ -54,7 +55,7 @@ def read_roads(
     lanes = [_lane(record, centres) for record in segments]
     crosswalks = [_crossing(record) for record in crossings]
     paved = [_line(record["area_boundary"]) for record in areas]
-    outlines = drivable_outline.find_edges(paved, list(centres.values()), cut_m, f"{path}: drivable_areas")
+    outlines = drivable_outline.find_edges(paved, list(centres.values()), OutlineNumbers(cut_m), f"{path}: drivable_areas")
     drawn = [*_marks(segments, borders), *((EDGE_BOUNDARY, xyz) for xyz in outlines)]
     start = max((line.id for line in (*lanes, *crosswalks)), default=0) + 1
     painted = [Polyline(kind, polylines.densify(xyz, point_spacing_m), start + place) for place, (kind, xyz) in enumerate(drawn)]

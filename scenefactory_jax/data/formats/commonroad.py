@@ -15,8 +15,8 @@ from scipy.spatial import KDTree
 from scenefactory_jax.core.raw_scene import LIGHT_STATES, Light, LightPlan, Polyline, RawScene, Reject, SceneError, Track
 from scenefactory_jax.core.types import CROSSWALK, LANE_BIKE, LANE_FREEWAY, LANE_STREET, STOP_SIGN, RoadUser
 from scenefactory_jax.data.formats import lanelet_map, scene_parts, xml_content
-from scenefactory_jax.data.formats.drivable_outline import Points
-from scenefactory_jax.data.formats.lanelet_map import Lanelet, OutlineNumbers
+from scenefactory_jax.data.formats.drivable_outline import OutlineNumbers, Points
+from scenefactory_jax.data.formats.lanelet_map import Lanelet
 from scenefactory_jax.data.formats.xml_content import Element
 from scenefactory_jax.data.generators import map_traffic
 

@@ -1,6 +1,7 @@
 """Road edges from the areas on which cars drive: the outline of all of them together."""
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 import shapely
@@ -15,15 +16,17 @@ Points = Float[np.ndarray, "_ 3"]  # any number of them
 SIMPLIFY_M = 0.01  # maximum distance of a closed outline from what it was
 
 
+@dataclass(frozen=True)
+class OutlineNumbers:
+    """Numbers of road edges."""
+
+    cut_m: float  # the map was cut where an outline comes so near to a lane's centre
+    seam_m: float = 0.0  # narrower gaps between areas are closed
+    hole_m2: float = 0.0  # smaller holes are closed
+
+
 def find_edges(
-    areas: Sequence[Points],
-    centres: Sequence[Points],
-    cut_m: float,
-    where: str,
-    *,
-    seam_m: float = 0.0,
-    hole_m2: float = 0.0,
-    spacing_m: float = np.inf,
+    areas: Sequence[Points], centres: Sequence[Points], numbers: OutlineNumbers, where: str, *, spacing_m: float = np.inf
 ) -> list[Points]:
     """The outline of all drivable areas together, without the pieces at which a lane leaves the map; heights are those of the corners.
 
@@ -31,10 +34,7 @@ def find_edges(
 
     Args:
         areas, centres: outlines of the areas, and lines of lanes.
-        cut_m: the map was cut where an outline comes so near to a lane's centre.
         where: file and key, for messages.
-        seam_m: narrower gaps between areas are closed.
-        hole_m2: smaller holes are closed.
         spacing_m: maximum between points.
     """
     areas = [xyz for xyz in areas if len(xyz) > 2]
@@ -42,15 +42,15 @@ def find_edges(
         return []
     try:
         area = shapely.union_all([shapely.make_valid(shapely.Polygon(xyz[:, :2])) for xyz in areas])
-        if seam_m > 0:
+        if (seam_m := numbers.seam_m) > 0:
             area = area.buffer(seam_m, join_style="mitre").buffer(-seam_m, join_style="mitre").simplify(SIMPLIFY_M)
         parts = [part for part in shapely.get_parts(area) if part.geom_type == "Polygon"]
-        parts = [shapely.Polygon(p.exterior, [hole for hole in p.interiors if shapely.Polygon(hole).area > hole_m2]) for p in parts]
+        parts = [shapely.Polygon(p.exterior, [hole for hole in p.interiors if shapely.Polygon(hole).area > numbers.hole_m2]) for p in parts]
         parts = [orient(part) for part in parts]
         lanes = shapely.union_all([shapely.LineString(xyz[:, :2]) for xyz in centres])
         rings = [np.asarray(ring.coords) for ring in shapely.get_rings(parts)]
         shapely.prepare(lanes)
-        gaps = [np.asarray(shapely.dwithin(lanes, shapely.linestrings(np.stack([r[:-1], r[1:]], axis=1)), cut_m)) for r in rings]
+        gaps = [np.asarray(shapely.dwithin(lanes, shapely.linestrings(np.stack([r[:-1], r[1:]], axis=1)), numbers.cut_m)) for r in rings]
     except (shapely.errors.ShapelyError, ValueError) as error:
         raise SceneError(f"{where}: no outline can be drawn around them: {error}") from error
     pieces = [polylines.densify(piece, spacing_m) for ring, cut in zip(rings, gaps, strict=True) for piece in _pieces(ring, cut)]

@@ -14,7 +14,7 @@ from scipy.spatial import KDTree
 from scenefactory_jax.core.raw_scene import Companion, FormatMismatch, Polyline, RawScene, SceneError, Track
 from scenefactory_jax.core.types import DRIVABLE, RoadUser
 from scenefactory_jax.data.formats import file_content, lanelet2, scene_parts
-from scenefactory_jax.data.formats.lanelet_map import OutlineNumbers
+from scenefactory_jax.data.formats.drivable_outline import OutlineNumbers
 
 COLUMNS = ("track_id", "frame_id", "timestamp_ms", "agent_type", "x", "y", "vx", "vy")
 BOXES = ("psi_rad", "length", "width")  # further columns, of vehicles

@@ -19,8 +19,8 @@ from scipy.spatial import KDTree
 from scenefactory_jax.core.raw_scene import Companion, Polyline, RawScene, Reject, SceneError
 from scenefactory_jax.core.types import CROSSWALK, EDGE_BOUNDARY, LANE_BIKE, LANE_FREEWAY, LANE_STREET, STOP_SIGN
 from scenefactory_jax.data.formats import lanelet_map, polylines, xml_content
-from scenefactory_jax.data.formats.drivable_outline import Points
-from scenefactory_jax.data.formats.lanelet_map import Lanelet, OutlineNumbers
+from scenefactory_jax.data.formats.drivable_outline import OutlineNumbers, Points
+from scenefactory_jax.data.formats.lanelet_map import Lanelet
 from scenefactory_jax.data.formats.opendrive_signals import Signal, group_lights
 from scenefactory_jax.data.formats.xml_content import Element
 from scenefactory_jax.data.generators import map_traffic

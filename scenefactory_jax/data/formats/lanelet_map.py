@@ -9,7 +9,7 @@ from scenefactory_jax.core.raw_scene import Polyline
 from scenefactory_jax.core.types import EDGE_BOUNDARY
 from scenefactory_jax.data.formats import drivable_outline, polylines
 from scenefactory_jax.data.formats.argoverse2_map import centre
-from scenefactory_jax.data.formats.drivable_outline import Points
+from scenefactory_jax.data.formats.drivable_outline import OutlineNumbers, Points
 
 
 @dataclass(frozen=True, eq=False)
@@ -26,15 +26,6 @@ class Lanelet:
     beside_right: tuple[int, ...] = ()
     limit: float | None = None  # m/s
     marks: tuple[tuple[int, Points], ...] = ()  # painted lines: kind, points
-
-
-@dataclass(frozen=True)
-class OutlineNumbers:
-    """Numbers of the road edges, see `drivable_outline.find_edges`."""
-
-    cut_m: float
-    seam_m: float
-    hole_m2: float
 
 
 def make_roads(
@@ -58,9 +49,7 @@ def make_roads(
     for kind, points in (mark for lanelet in lanelets for mark in lanelet.marks):
         rows = tuple(map(tuple, points.tolist()))
         marks.setdefault(min(rows, rows[::-1]), (kind, polylines.densify(points, spacing_m)))
-    edges = drivable_outline.find_edges(
-        areas, [*centres.values(), *unbounded], outline.cut_m, where, seam_m=outline.seam_m, hole_m2=outline.hole_m2, spacing_m=spacing_m
-    )
+    edges = drivable_outline.find_edges(areas, [*centres.values(), *unbounded], outline, where, spacing_m=spacing_m)
     keep = lambda ids: tuple(dict.fromkeys(number for number in ids if number in lanes))  # noqa: E731
     roads = [
         Polyline(

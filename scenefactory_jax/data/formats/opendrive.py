@@ -14,6 +14,7 @@ import numpy as np
 from scenefactory_jax.core.raw_scene import Polyline, RawScene, Reject, SceneError
 from scenefactory_jax.core.types import CROSSWALK, EDGE_BOUNDARY, STOP_SIGN
 from scenefactory_jax.data.formats import drivable_outline, opendrive_links, opendrive_signals, xml_content
+from scenefactory_jax.data.formats.drivable_outline import OutlineNumbers
 from scenefactory_jax.data.formats.opendrive_lanes import DRIVEN, Key, Lane, Line, Road
 from scenefactory_jax.data.formats.xml_content import Element
 from scenefactory_jax.data.generators import map_traffic
@@ -34,9 +35,7 @@ def read(
     path: Path,
     *,
     point_spacing_m: float,
-    cut_m: float,
-    seam_m: float,
-    hole_m2: float,
+    outline: OutlineNumbers,
     road_limit_m: float,
     element_limit: int,
     file_limit_mb: int,
@@ -46,7 +45,7 @@ def read(
 
     Args:
         path, point_spacing_m, file_limit_mb: see `formats`.
-        cut_m, seam_m, hole_m2: of the outline, see `drivable_outline.find_edges`.
+        outline: of the road edges.
         road_limit_m: longer maps, by the lengths of their roads, are refused.
         element_limit: files of more elements are refused.
         traffic: entry of `map_traffic.draw_scenes`; None: one scene without road users.
@@ -65,11 +64,10 @@ def read(
     signals = opendrive_signals.read_signals(roads, shapes.lanes, exits)
     ids = {key: number for number, key in enumerate(shapes.lanes)}
     centres = [lane.xyz for lane in shapes.lanes.values()]
-    look = {"seam_m": seam_m, "hole_m2": hole_m2, "spacing_m": point_spacing_m}
-    outlines = drivable_outline.find_edges(shapes.areas, centres, cut_m, f"{path}: lanes", **look)
-    crosswalks = [outline for road in roads.values() for outline in opendrive_signals.read_crosswalks(road)]
+    outlines = drivable_outline.find_edges(shapes.areas, centres, outline, f"{path}: lanes", spacing_m=point_spacing_m)
+    crosswalks = [area for road in roads.values() for area in opendrive_signals.read_crosswalks(road)]
     features = [*shapes.marks, *((EDGE_BOUNDARY, xyz) for xyz in outlines)]
-    features += [(CROSSWALK, outline) for outline in crosswalks]
+    features += [(CROSSWALK, area) for area in crosswalks]
     lines = [Polyline(kind, xyz, len(ids) + place) for place, (kind, xyz) in enumerate(features)]
     signs = [
         Polyline(STOP_SIGN, sign.place, len(ids) + len(lines) + place, lanes=tuple(ids[key] for key in sign.lanes))
