@@ -36,7 +36,7 @@ def read(
     *,
     point_spacing_m: float,
     outline: OutlineNumbers,
-    road_limit_m: float,
+    lane_limit_m: float,
     element_limit: int,
     file_limit_mb: int,
     traffic: dict[str, Any] | None,
@@ -46,12 +46,12 @@ def read(
     Args:
         path, point_spacing_m, file_limit_mb: see `formats`.
         outline: of the road edges.
-        road_limit_m: longer maps, by the lengths of their roads, are refused.
+        lane_limit_m: longer maps, by the lanes of their roads, are refused.
         element_limit: files of more elements are refused.
         traffic: entry of `map_traffic.draw_scenes`; None: one scene without road users.
     """
     document = xml_content.load(path, ROOT, file_limit_mb=file_limit_mb, element_limit=element_limit)
-    roads = _read_roads(document, road_limit_m)
+    roads = _read_roads(document, lane_limit_m)
     shapes = _read_shapes(roads, point_spacing_m)
     if not shapes.lanes:
         raise SceneError(f"{path}: expected lanes of the types {', '.join(DRIVEN)}, got none")
@@ -94,14 +94,16 @@ def read(
     yield from map_traffic.draw(scene, phases, traffic)
 
 
-def _read_roads(document: Element, road_limit_m: float) -> dict[str, Road]:
+def _read_roads(document: Element, lane_limit_m: float) -> dict[str, Road]:
     """The roads by their ids."""
     roads: dict[str, Road] = {}
     total = 0.0
     for record in document.all("road"):
-        total += max(record.number("length"), sum(geometry.number("length") for geometry in record.walk("planView", "geometry")))
-        if not record.number("length") >= 0 or total > road_limit_m:
-            bound = f"roads of 0 to {road_limit_m:g} m together (formats.opendrive.road_limit_m)"
+        length = max(record.number("length"), sum(geometry.number("length") for geometry in record.walk("planView", "geometry")))
+        lanes = [sum(len(side.children) for side in section.children) for section in record.walk("lanes", "laneSection")]
+        total += length * max([1, *lanes])
+        if not record.number("length") >= 0 or total > lane_limit_m:
+            bound = f"lanes of 0 to {lane_limit_m:g} m together (formats.opendrive.lane_limit_m)"
             raise SceneError(f"{record.where}: length: expected {bound}, got {total:g} up to this road")
         road = Road(record)
         if road.id in roads:
