@@ -1,12 +1,10 @@
 """Laws of towns: lanes connect, road users touch neither each other nor kerbs, and obey lights, signs and right of way."""
 
-from pathlib import Path
 
 import jaxtyping
 import numpy as np
 import pytest
 import shapely
-import yaml
 
 from scenefactory_jax.cli import hydra_config
 from scenefactory_jax.core import schema
@@ -28,7 +26,7 @@ from scenefactory_jax.data.loading import scene_source
 from scenefactory_jax.data.packing.pack import prepare
 from scenefactory_jax.visualization.report import scene_comparison
 
-CONFIG = yaml.safe_load((Path(__file__).resolve().parents[2] / "conf" / "scenes" / "town.yaml").read_text())["generate"]
+CONFIG = hydra_config.load_config("scenes", "scenes=town")["scenes"]["generate"]
 TRAFFIC, NETWORK = CONFIG["traffic"], CONFIG["network"]
 DRIVER = driver_model.DriverParameters(**TRAFFIC["driver"])
 RED = {LIGHT_STATES.index("stop"), LIGHT_STATES.index("arrow_stop")}

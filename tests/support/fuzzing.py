@@ -1,5 +1,6 @@
 """Damaged files for the tests of readers: whatever lies in a file, a reader says SceneError (or one of its kinds) and nothing else."""
 
+import re
 import tracemalloc
 
 import numpy as np
@@ -113,3 +114,12 @@ def _with(node, place, value):
     else:
         copy[key] = value
     return copy
+
+
+def junk_in_xml(text: str, *, count: int, seed: int = 0):
+    """(what, text) of documents in which an attribute or a text of an element is junk."""
+    random, places = np.random.default_rng(seed), [match.span(1) for match in re.finditer(r'="([^"]*)"', text)]
+    places += [match.span(1) for match in re.finditer(r">([^<>\s]+)<", text)]
+    for junk in ("", "-1", "1e300", "nan", "x", "0", "99999999999", "-3.5e4"):
+        for start, end in random.choice(places, count, replace=False):
+            yield f"{junk!r} at {start}", text[:start] + junk + text[end:]

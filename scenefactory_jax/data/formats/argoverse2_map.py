@@ -11,13 +11,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import shapely
 from jaxtyping import Float
-from scipy.spatial import KDTree
 
 from scenefactory_jax.core.raw_scene import Polyline, SceneError
 from scenefactory_jax.core.types import CROSSWALK, EDGE_BOUNDARY, LANE_BIKE, LANE_STREET
-from scenefactory_jax.data.formats import file_content, polylines, values
+from scenefactory_jax.data.formats import drivable_outline, file_content, polylines, values
+from scenefactory_jax.data.formats.drivable_outline import OutlineNumbers
 from scenefactory_jax.data.formats.values import AXES, Node
 
 SECTIONS = ("lane_segments", "drivable_areas", "pedestrian_crossings")
@@ -55,7 +54,8 @@ def read_roads(
     }
     lanes = [_lane(record, centres) for record in segments]
     crosswalks = [_crossing(record) for record in crossings]
-    outlines = _edges([_line(record["area_boundary"]) for record in areas], list(centres.values()), cut_m, f"{path}: ")
+    paved = [_line(record["area_boundary"]) for record in areas]
+    outlines = drivable_outline.find_edges(paved, list(centres.values()), OutlineNumbers(cut_m), f"{path}: drivable_areas")
     drawn = [*_marks(segments, borders), *((EDGE_BOUNDARY, xyz) for xyz in outlines)]
     start = max((line.id for line in (*lanes, *crosswalks)), default=0) + 1
     painted = [Polyline(kind, polylines.densify(xyz, point_spacing_m), start + place) for place, (kind, xyz) in enumerate(drawn)]
@@ -126,31 +126,3 @@ def _crossing(record: Node) -> Polyline:
     if (first[-1] - first[0]) @ (second[-1] - second[0]) > 0:
         second = second[::-1]
     return Polyline(kind=CROSSWALK, xyz=np.concatenate([first, second]), id=record["id"].expect(int))
-
-
-def _edges(areas: list[Points], centres: list[Points], cut_m: float, where: str) -> list[Points]:
-    """The outline of all drivable areas together, without the pieces at which a lane leaves the map; heights are those of the corners."""
-    areas = [xyz for xyz in areas if len(xyz) > 2]
-    if not areas:
-        return []
-    try:
-        area = shapely.union_all([shapely.make_valid(shapely.Polygon(xyz[:, :2])) for xyz in areas])
-        lanes = shapely.union_all([shapely.LineString(xyz[:, :2]) for xyz in centres])
-        rings = [np.asarray(ring.coords) for ring in shapely.get_rings(shapely.get_parts(area))]
-        gaps = [np.asarray(shapely.distance(shapely.linestrings(np.stack([r[:-1], r[1:]], axis=1)), lanes)) < cut_m for r in rings]
-    except (shapely.errors.ShapelyError, ValueError) as error:
-        raise SceneError(f"{where}drivable_areas: no outline can be drawn around them: {error}") from error
-    pieces = [piece for ring, cut in zip(rings, gaps, strict=True) for piece in _pieces(ring, cut)]
-    corners = np.concatenate(areas)
-    tree = KDTree(corners[:, :2])
-    return [np.column_stack([piece, corners[tree.query(piece)[1], 2]]) for piece in pieces]
-
-
-def _pieces(ring: Float[np.ndarray, "N 2"], cut: np.ndarray) -> list[Float[np.ndarray, "K 2"]]:
-    """The pieces of a closed ring between the segments that are cut."""
-    if not cut.any():
-        return [ring]
-    first = int(np.flatnonzero(cut)[0])
-    points, gaps = np.roll(ring[:-1], -first - 1, axis=0), np.roll(cut, -first - 1)  # begins behind a gap and ends with it
-    starts = np.concatenate([[0], np.flatnonzero(gaps[:-1]) + 1])
-    return [points[start : stop + 1] for start, stop in zip(starts, np.flatnonzero(gaps), strict=True) if stop > start]

@@ -13,7 +13,7 @@ def resample(line: Float[np.ndarray, "N 3"], count: int) -> Float[np.ndarray, "K
     return np.stack([np.interp(places, arc, line[:, axis]) for axis in range(3)], axis=1)
 
 
-def densify(line: Float[np.ndarray, "N 3"], spacing_m: float) -> Float[np.ndarray, "M 3"]:
+def densify(line: Float[np.ndarray, "N D"], spacing_m: float) -> Float[np.ndarray, "M D"]:
     """The line with further points, in even steps, on segments longer than `spacing_m`.
 
     Packing takes the long segments of a source with corners alone for gaps. A line that needs more than `MAX_ADDED_POINTS` is unchanged.

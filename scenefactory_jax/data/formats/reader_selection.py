@@ -97,20 +97,21 @@ def read(path: Path | str, formats: Mapping[str, Reader]) -> Iterator[RawScene |
 
 def _find_reader(path: Path, formats: Mapping[str, Reader]) -> tuple[RawScene | Reject, Iterator[RawScene | Reject]]:
     """The first scene of the first reader that accepts the file, and the iterator over the others."""
-    refusals: list[str] = []
+    refusals: dict[str, str] = {}
     for name, reader in formats.items():
         scenes = iter(reader(path))
         try:
             first = next(scenes, None)
         except OtherContent as refusal:
-            refusals.append(textwrap.shorten(f"{name}: {str(refusal).removeprefix(f'{path}: ')}", MAX_REASON))
+            refusals[name] = textwrap.shorten(f"{name}: {str(refusal).removeprefix(f'{path}: ')}", MAX_REASON)
             continue
         except FormatMismatch:
             continue
         if first is None:
             raise SceneError(f"{path}: the reader {name!r} found no scene")
         return first, scenes
-    raise SceneError(f"{path}: {_explain(path, refusals)}; formats: {', '.join(formats) or 'none'}")
+    others = [name for name in formats if name not in refusals]
+    raise SceneError(f"{path}: {_explain(path, list(refusals.values()))}; formats: {', '.join(others) or 'none'}")
 
 
 def _explain(path: Path, refusals: Sequence[str]) -> str:

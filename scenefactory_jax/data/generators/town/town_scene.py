@@ -114,7 +114,7 @@ def _draw_scene(
     times = add_warmup(log.times, log.warmup_s)
     gates: Gates = draw_gates(rng, network, times)
     for _ in range(MAX_TRAFFIC_REDRAWS):
-        recorded = _record(rng, draw_traffic(rng, network, pavements, surface, reach, times, gates), log)
+        recorded = record(rng, draw_traffic(rng, network, pavements, surface, reach, times, gates), log)
         if recorded is not None:
             users, sdc = recorded
             blocks = {name: network.blocks.count(name) for name in sorted(set(network.blocks))}
@@ -122,7 +122,7 @@ def _draw_scene(
                 name=f"town-{kind}",
                 source="generator",
                 roads=_to_polylines(network, outer, islands, driveways, lane_spacing, line_spacing),
-                tracks=tuple(_to_track(i, user) for i, user in enumerate(users)),
+                tracks=tuple(to_track(i, user) for i, user in enumerate(users)),
                 times=log.times,
                 current=log.current,
                 sdc=sdc,
@@ -132,7 +132,7 @@ def _draw_scene(
     return None
 
 
-def _record(rng: np.random.Generator, users: list[TownUser], log: Log) -> tuple[list[TownUser], int] | None:
+def record(rng: np.random.Generator, users: list[TownUser], log: Log) -> tuple[list[TownUser], int] | None:
     """Chooses the recording car near the middle and limits the log to its sensor range.
 
     Returns:
@@ -206,7 +206,7 @@ def _to_lights(network: Network, gates: Gates, steps: int) -> tuple[Light, ...]:
     )
 
 
-def _to_track(index: int, user: TownUser) -> Track:
+def to_track(index: int, user: TownUser) -> Track:
     """Converts a road user to a track, with zeros at invalid steps."""
     valid = user.valid
     position = np.concatenate([user.position, np.full((len(valid), 1), user.size[2] / 2)], axis=1)
