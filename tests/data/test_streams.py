@@ -20,7 +20,7 @@ from scenefactory_jax.core.instantiate import ConfigError, instantiate
 from scenefactory_jax.core.parallel import task_map
 from scenefactory_jax.core.raw_scene import SceneError
 from scenefactory_jax.data.bank import bank_reader
-from scenefactory_jax.data.loading import batches, samplers, scene_source, stream
+from scenefactory_jax.data.loading import batches, mixture, samplers, scene_source, stream
 from scenefactory_jax.learning import checkpoint
 from scenefactory_jax.learning.training_loop import train as run_train
 from scenefactory_jax.loggers import metrics_csv
@@ -218,7 +218,7 @@ def loader_of(found):
 
 
 def measured(loader, *, sample=8, **given):
-    return batches.measure(loader, sample=sample, headroom=1.0, given=given, seed=0)
+    return batches.measure(loader, sample=mixture.choose_sample(loader.source, (), sample, seed=0), headroom=1.0, given=given)
 
 
 def test_every_world_holds_the_scene_that_the_stream_says():

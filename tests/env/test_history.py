@@ -32,7 +32,8 @@ def test_a_row_is_kept_of_every_tenth_of_a_second():
     assert not kept.valid.any()
     for step in range(7):
         motion = replace(state.motion, position=jnp.full((2, 3), float(step)))
-        kept = record(kept, motion, state.active, scene.traffic, jnp.int32(step))
+        kept = record(kept, motion, state.active, scene.traffic, jnp.int32(step), jnp.full((2, 3), 0.1 * step))
+    np.testing.assert_allclose(kept.action[:, 0, 2], [0.6, 0.3, 0.0])
     np.testing.assert_array_equal(kept.position[:, 0, 0], [6.0, 3.0, 0.0])
     assert kept.valid.all()
     again = history.restart(kept, jnp.array([True, False]))

@@ -35,6 +35,11 @@ def empty(scenes: int | None) -> SceneOutcomes:
     return SceneOutcomes(np.zeros(count, int), np.zeros(count), np.zeros(count), endless=scenes is None)
 
 
+def take_rows(table: SceneOutcomes, rows: Int[np.ndarray, " M"]) -> SceneOutcomes:
+    """The table of some scenes alone."""
+    return replace(table, **{name: getattr(table, name)[rows] for name in ("draws", "episodes", "successes")})
+
+
 def count_draws(table: SceneOutcomes, indices: Draws) -> SceneOutcomes:
     """The table after these draws; an endless one grows by those beyond it."""
     if table.endless:
