@@ -18,6 +18,7 @@ from jaxtyping import Float
 from matplotlib.figure import Figure
 from scipy import stats
 
+from experiments.drive import evaluations
 from scenefactory_jax.core import config as run_config
 from scenefactory_jax.core import markdown, result_file
 from scenefactory_jax.learning.training_loop import YEAR_S
@@ -67,8 +68,8 @@ def make_curves(runs: Sequence[Mapping[str, np.ndarray]], bins: int) -> dict[str
     kept = np.flatnonzero((years > 0).all(axis=0))  # an iteration may be longer than a bin
     for event in EVENTS:
         rates = [estimate_rate(total(event)[:, index], years[:, index]) for index in kept]
-        names = ("rate", "low", "high")
-        curves[event] = {"years": np.append(edges, shortest)[kept].tolist()} | dict(zip(names, map(list, zip(*rates, strict=True)), strict=True))
+        columns = dict(zip(("rate", "low", "high"), map(list, zip(*rates, strict=True)), strict=True))
+        curves[event] = {"years": np.append(edges, shortest)[kept].tolist(), **columns}
     return curves
 
 
@@ -94,10 +95,11 @@ def write_table(curves: Mapping[str, Mapping[str, Curve]], speed: Mapping[str, f
     rows = []
     for name, found in curves.items():
         last = [[curve[key][-1] for key in ("rate", "low", "high")] for curve in found.values()]
-        rows.append([name, f"{years[name]:.3g}", f"{speed[name]:.3g}", *(f"{rate:,.0f} [{low:,.0f}, {high:,.0f}]" for rate, low, high in last)])
+        cells = [f"{rate:,.0f} [{low:,.0f}, {high:,.0f}]" for rate, low, high in last]
+        rows.append([name, f"{years[name]:.3g}", f"{speed[name]:.3g}", *cells])
     header = ["runs", "years a run", "years an hour", *(f"{event}, a year" for event in EVENTS)]
-    text = __doc__ or ""
-    path.write_text("\n".join(["# Events a year of driving", "", text.strip().split("\n\n")[2], "", markdown.format_table(header, rows), ""]))
+    about = (__doc__ or "").split("\n\n")[2].strip()
+    path.write_text("\n".join(["# Events a year of driving", "", about, "", markdown.format_table(header, rows), ""]))
     return path
 
 
@@ -108,7 +110,7 @@ def main() -> None:
     parser.add_argument("--bins", type=int, default=20)
     parser.add_argument("--out", type=Path, default=HERE)
     given = parser.parse_args()
-    named = {name: [read_run(Path(folder)) for folder in folders.split(",")] for name, _, folders in (words.partition("=") for words in given.runs)}
+    named = {name: [read_run(Path(folder)) for folder in folders] for name, folders in evaluations.parse_runs(given.runs).items()}
     curves = {name: make_curves(runs, given.bins) for name, runs in named.items()}
     years = {name: float(np.mean([run["years"].sum() for run in runs])) for name, runs in named.items()}
     speed = {name: float(np.mean([run["years"].sum() / run["hours"].sum() for run in runs])) for name, runs in named.items()}

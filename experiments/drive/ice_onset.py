@@ -17,7 +17,8 @@ import jax
 import numpy as np
 from jaxtyping import Bool, Float
 
-from scenefactory_jax.cli import hydra_config
+from experiments.drive import evaluations
+from experiments.drive.evaluations import Asked
 from scenefactory_jax.core import config as run_config
 from scenefactory_jax.core import markdown, result_file
 from scenefactory_jax.data.loading import scene_source
@@ -26,7 +27,7 @@ from scenefactory_jax.learning import checkpoint, policy_io
 from scenefactory_jax.learning.training_loop import make_policy
 
 HERE = Path(__file__).parent
-ICE, DRY = [], ["weather.patches.routes.surface=AC"]
+ICE, DRY = (), ("weather.patches.routes.surface=AC",)
 MU_CHANGE = 0.01  # of the mean over four wheels: a wheel on the strip changes it by a quarter of the difference or more
 
 
@@ -58,17 +59,20 @@ def drive(config: Mapping[str, Any], parameters: Any, scenes: scene_source.Scene
     return Drive(*map(np.asarray, (shots.active, throttle_and_brake, shots.grip)))
 
 
-def measure_run(run: str, scenes: str | None, words: list[str], change: float) -> dict[str, np.ndarray]:
+def measure_run(run: str, given: argparse.Namespace) -> dict[str, np.ndarray]:
     """Measures one run; the worlds are numbers of the scenes."""
-    protocol = hydra_config.load_config("evaluate", f"run={run}", "protocol=ice_onset", *[word for word in words if word.startswith("protocol.")])
-    own = [*hydra_config.list_overrides(protocol["protocol"]["settings"]), *[word for word in words if not word.startswith("protocol.")]]
-    folder = policy_io.find(run)
-    drives, parameters = [], checkpoint.restore_parameters(folder / "checkpoints")
+    drives, parameters = [], checkpoint.restore_parameters(policy_io.find(run) / "checkpoints")
     for road in (ICE, DRY):
-        config = hydra_config.apply_overrides(hydra_config.read(folder), [*own, "termination=strict", *road])
-        loaded = scene_source.load_heldout_scenes(config["scenes"], path=scenes)
+        asked = Asked((run,), None, ("protocol=ice_onset", f"protocol.mu={given.mu}"), (*given.overrides, *road), given.scenes)
+        config, _ = evaluations.compose(asked)
+        loaded = scene_source.load_heldout_scenes(config["scenes"], path=given.scenes)
         drives.append(drive(config, parameters, loaded, environment.episode_steps(config["timing"])))
-    return measure_notice(*drives, change=change, control_hz=float(config["timing"]["control_hz"]))
+    return measure_notice(*drives, change=given.change, control_hz=float(config["timing"]["control_hz"]))
+
+
+def find_median(times: Float[np.ndarray, " N"]) -> float:
+    """Finds the median of the agents that notice; NaN: none does."""
+    return float(np.nanmedian(times)) if not np.isnan(times).all() else float("nan")
 
 
 def summarise(found: list[dict[str, np.ndarray]], *, bootstrap: int, seed: int) -> dict[str, Any]:
@@ -78,7 +82,7 @@ def summarise(found: list[dict[str, np.ndarray]], *, bootstrap: int, seed: int) 
     rows = {scene: np.flatnonzero(world == scene) for scene in scenes.tolist()}
     draws = [np.concatenate([rows[scene] for scene in generator.choice(scenes, len(scenes)).tolist()]) for _ in range(bootstrap)]
     numbers: dict[str, Any] = {"agents": len(world), "runs": len(found)}
-    for name, compute in {"noticed": lambda s: np.mean(~np.isnan(s)), "median_s": lambda s: np.nanmedian(s) if (~np.isnan(s)).any() else np.nan}.items():
+    for name, compute in (("noticed", lambda times: np.mean(~np.isnan(times))), ("median_s", find_median)):
         low, high = np.nanpercentile([compute(seconds[draw]) for draw in draws], [2.5, 97.5]).tolist()
         numbers[name] = {"value": float(compute(seconds)), "low": low, "high": high}
     return numbers
@@ -97,18 +101,16 @@ def main() -> None:
     given = parser.parse_args()
     scene_source.use_compilation_cache()
     rows = {}
-    for name, _, folders in (words.partition("=") for words in given.runs):
-        words = [f"protocol.mu={given.mu}", *given.overrides]
-        found = [measure_run(run, given.scenes, words, given.change) for run in folders.split(",")]
-        rows[name] = summarise(found, bootstrap=given.bootstrap, seed=0)
+    for name, runs in evaluations.parse_runs(given.runs).items():
+        rows[name] = summarise([measure_run(run, given) for run in runs], bootstrap=given.bootstrap, seed=0)
         print(name, result_file.plain(rows[name], digits=3), flush=True)
     given.out.mkdir(parents=True, exist_ok=True)
     numbers = {"mu": given.mu, "change": given.change, "scenes": given.scenes, "versions": run_config.versions()}
     result_file.write(given.out / "ice_onset.json", {"rows": rows, **numbers}, digits=4)
-    show = lambda part, scale, unit: f"{scale * part['value']:.2f} [{scale * part['low']:.2f}, {scale * part['high']:.2f}]{unit}"  # noqa: E731
-    cells = [[name, row["runs"], row["agents"], show(row["noticed"], 100, " %"), show(row["median_s"], 1, " s")] for name, row in rows.items()]
+    show = lambda part, scale: "{value:.2f} [{low:.2f}, {high:.2f}]".format(**{key: scale * part[key] for key in part})  # noqa: E731
+    cells = [[name, row["runs"], row["agents"], show(row["noticed"], 100), show(row["median_s"], 1)] for name, row in rows.items()]
     head = f"# Time to notice ice\n\nFriction {given.mu:g} from 15 m after the start on; pedal changed by {given.change:g} or more.\n\n"
-    table = markdown.format_table(["policy", "runs", "agents on ice", "noticed", "median time after onset"], cells)
+    table = markdown.format_table(["policy", "runs", "agents on ice", "noticed, %", "median time after onset, s"], cells)
     (given.out / "ice_onset.md").write_text(f"{head}{table}\n")
 
 

@@ -104,8 +104,8 @@ def start_history(
 def _read_rows(
     log: Any, rows: Int[Array, " K"], start_row: Int[Array, ""] | int, place: Float[Array, "B 2"], dt: Float[Array, ""]
 ) -> dict[str, Array]:
-    """Rows of logged tracks, by the names of `History`; valid where the log is and the road user is at its logged place at `start_row`, or where the row before leads
-    (a perturbed start)."""
+    """Rows of logged tracks, by the names of `History`; valid where the log is and the road user is at its logged place at `start_row`, or
+    where the row before leads (a perturbed start)."""
     last = log.valid.shape[1] - 1
     start, before = jnp.clip(start_row, 0, last), jnp.clip(start_row - 1, 0, last)
     is_near = lambda logged: jnp.sum((logged - place) ** 2, axis=-1) < ON_LOG_M**2  # noqa: E731

@@ -17,8 +17,8 @@ def motion_history(
 ) -> Float[Array, "A F"]:
     """The last action, and ten rows of the last second, the newest first.
 
-    Columns: throttle, steer and brake that led to the present state; then for each row of `State.history`, 0.1 s apart: velocity x, y in the
-    car's frame of that time; change of the velocity x, y in that frame and of the yaw from there to the row after it, over 0.1 s; throttle,
+    Columns: throttle, steer and brake that led to the present state; then for each row of `State.history`, 0.1 s apart: velocity x, y in
+    the car's frame of that time; change of the velocity x, y in that frame, and of the yaw, until the row after it, over 0.1 s; throttle,
     steer and brake that led there, which the log does not have; 1. Rows before a start are zeros.
     """
     motion, past, count = state.motion, state.history, len(state.active)
