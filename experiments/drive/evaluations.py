@@ -56,8 +56,8 @@ def compose(asked: Asked) -> tuple[dict[str, Any], dict[str, Any]]:
     protocol, planned = found["protocol"], asked.planner or ""
     words = [*hydra_config.list_overrides(protocol["settings"]), f"termination={protocol['termination'][-1]}", *asked.overrides]
     if asked.planner:
-        words += [*found["planner_overrides"][planned], *protocol.get("planner_overrides", {}).get(planned, [])]
-        return hydra_config.load_config("train", "scenes=town", *words), found
+        own = [*found["planner_overrides"][planned], *protocol.get("planner_overrides", {}).get(planned, [])]
+        return hydra_config.apply_overrides(hydra_config.load_config("train", "scenes=town", *words), own), found
     return hydra_config.apply_overrides(hydra_config.read(policy_io.find(name)), words), found
 
 
