@@ -42,11 +42,11 @@ class Drive(NamedTuple):
 def measure_notice(ice: Drive, dry: Drive, *, change: float, control_hz: float) -> dict[str, np.ndarray]:
     """Finds the agents that reach the strip, [N]: their world, and the seconds from the onset until they notice; NaN: never."""
     both = ice.active & dry.active
-    on_ice = ice.active & (np.abs(ice.mu - dry.mu) > MU_CHANGE) & np.logical_and.accumulate(both, axis=1)
-    other = both & (np.abs(ice.pedal - dry.pedal) >= change)
-    world, agent = np.nonzero(on_ice.any(axis=1))
+    on_ice = both & np.greater(np.abs(ice.mu - dry.mu), MU_CHANGE) & np.logical_and.accumulate(both, axis=1)
+    other = both & np.greater_equal(np.abs(ice.pedal - dry.pedal), change)
+    world, agent = np.nonzero(np.any(on_ice, axis=1))
     onset, noticed = (np.argmax(mask, axis=1)[world, agent] for mask in (on_ice, other))
-    after = np.where(other.any(axis=1)[world, agent], (noticed - onset) / control_hz, np.nan)
+    after = np.where(np.any(other, axis=1)[world, agent], (noticed - onset) / control_hz, np.nan)
     return {"world": world, "notice_s": after}
 
 
