@@ -76,6 +76,17 @@ def test_each_source_has_its_share_of_any_number_of_draws(banks):
     assert sorted(index - 8 for index in drawn if index >= 8) == list(range(20))
 
 
+@pytest.mark.parametrize("counts", [[1] * 120, [2, 1, 5] * 15, [64, 1, 64]])
+def test_shares_hold_for_draws_one_by_one(banks, counts):
+    _, parts = opened(configured(banks, "stream.shares={womd:0.3,womd_links:0.3,generator:0.4}"))
+    draw = mixture.share_draws(lambda table, count: samplers.prioritize_failures(table, count, seed=0, floor=0.5), parts, seed=0)
+    table, total = samplers.SceneOutcomes(*(np.zeros(8, kind) for kind in (int, float, float)), endless=True), 0
+    for count in counts:
+        table, total = samplers.count_draws(table, draw(table, count)), total + count
+        assert table.draws.sum() == total
+        assert all(abs(part.take(table).draws.sum() - part.share * total) <= 1.0 for part in parts)
+
+
 def test_a_source_that_fails_takes_no_draws_from_the_others(banks):
     _, parts = opened(configured(banks))
     numbers = {"seed": 0, "floor": 0.5}

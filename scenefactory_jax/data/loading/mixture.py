@@ -123,17 +123,18 @@ def choose_sample(source: SceneSource, parts: tuple[Part, ...], count: int, *, s
 def share_draws(sampler: Sampler, parts: tuple[Part, ...], *, seed: int) -> Sampler:
     """A sampler that draws from each part by its share, and within a part by `sampler`, from its own outcomes.
 
-    Of any number of draws in a row each part has its share, to a draw. Their order is random, so that the devices have all parts.
+    Each draw is of the part that lacks most of its share, so that the draws of all parts are as their shares, to a draw. Their order is
+    random, so that the devices have all parts.
     """
-    bounds = np.cumsum([0.0, *(part.share for part in parts)])
-    bounds[-1] = 1.0  # not less by rounding
+    shares = np.array([part.share for part in parts])
 
     def draw(table: SceneOutcomes, count: int) -> Draws:
         before = int(table.draws.sum())
-        edges = np.floor((before + count) * bounds + 0.5).astype(int) - np.floor(before * bounds + 0.5).astype(int)
-        drawn = [
-            part.first + sampler(part.take(table), number) for part, number in zip(parts, np.diff(edges).tolist(), strict=True) if number
-        ]
+        had = np.array([part.take(table).draws.sum() for part in parts])
+        numbers = np.zeros(len(parts), int)
+        for total in range(before + 1, before + count + 1):
+            numbers[np.argmax(total * shares - had - numbers)] += 1
+        drawn = [part.first + sampler(part.take(table), int(number)) for part, number in zip(parts, numbers, strict=True) if number]
         return np.random.default_rng((seed, before, len(parts))).permutation(np.concatenate(drawn))
 
     return draw
