@@ -16,6 +16,7 @@ import matplotlib
 import numpy as np
 from jaxtyping import Float
 from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
 from scipy import stats
 
 from experiments.drive import evaluations
@@ -84,6 +85,7 @@ def draw(curves: Mapping[str, Mapping[str, Curve]], path: Path) -> Path:
                 (line,) = axes.plot(curve["years"], curve["rate"], label=name)
                 axes.fill_between(curve["years"], curve["low"], curve["high"], color=line.get_color(), alpha=0.2, linewidth=0)
             axes.set(title=event, xlabel="years of driving", yscale="symlog", ylim=(0.0, None))
+            axes.xaxis.set_major_locator(MaxNLocator(4))
             if number == 0:
                 axes.set_ylabel("events a year of driving")
                 axes.legend()
