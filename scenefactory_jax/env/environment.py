@@ -341,7 +341,9 @@ def _advance(parts: EnvParts, scene: Scene, state: State, action: Float[Array, "
         motion=motion,
         route=parts.advance_route(scene, state, motion, speed=safe_norm(motion.velocity[:, :2])),
         traffic=parts.traffic.advance(scene, state.traffic, cars, state.step),
-        history=history.record(parts.history, state.history, state.motion, state.active, scene.traffic, state.step),
+        history=history.record(
+            parts.history, state.history, state.motion, state.active, scene.traffic, state.step, state.previous_action
+        ),
         weather=scene.weather,
         steps_since_spawn=state.steps_since_spawn + state.active.astype(jnp.int32),
         previous_action=action,

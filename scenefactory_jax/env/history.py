@@ -28,6 +28,7 @@ class History:
     yaw: Float[Array, "K B"]
     velocity: Float[Array, "K B 2"]
     valid: Bool[Array, "K B"]
+    action: Float[Array, "K A 3"]  # of the agents alone: throttle, steer, brake that led there; zeros at a start
 
 
 class HistorySpec(NamedTuple):
@@ -77,7 +78,7 @@ def start_history(
     """Returns the history at a start, see the module; `scene.traffic` are the boxes at that time."""
     if spec is None:
         return ()
-    now = _join(motion, agents.present, scene.traffic)
+    now = _join(motion, agents.present, scene.traffic, jnp.zeros((len(motion.yaw), 3), jnp.float32))
     repeated = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (spec.rows, *leaf.shape)), now)
     repeated = replace(repeated, valid=jnp.zeros_like(repeated.valid))
     if spec.start_row == 0:
@@ -87,23 +88,24 @@ def start_history(
     car_rows = spec.start_row - jnp.round(age / dt).astype(jnp.int32)
     traffic_rows = jnp.round(spec.start_row + (step * control_dt - age) / dt).astype(jnp.int32)
     cars = _read_rows(scene.log, car_rows, spec.start_row, motion.position[:, :2], dt)
+    states = {name: getattr(repeated, name) for name in cars}  # without the actions, which no log has
     boxes = scene.traffic
     if boxes.yaw.shape == scene.traffic_log.kind.shape:
         start = spec.start_row + jnp.round(step * control_dt / dt).astype(jnp.int32)
         others = _read_rows(scene.traffic_log, traffic_rows, start, boxes.position, dt)
     else:  # traffic that has other rows than the log
-        others = jax.tree.map(lambda leaf: leaf[:, len(motion.yaw) :], repeated)
-    logged = jax.tree.map(lambda *parts: jnp.concatenate(parts, axis=1), cars, others)
-    valid = logged.valid & now.valid
+        others = {name: leaf[:, len(motion.yaw) :] for name, leaf in states.items()}
+    logged = {name: jnp.concatenate([cars[name], others[name]], axis=1) for name in states}
+    valid = logged["valid"] & now.valid
     keep = lambda new, old: jnp.where(valid.reshape(valid.shape + (1,) * (new.ndim - 2)), new, old)  # noqa: E731
-    return jax.tree.map(keep, replace(logged, valid=valid), repeated)
+    return replace(repeated, **jax.tree.map(keep, logged | {"valid": valid}, states))
 
 
 def _read_rows(
     log: Any, rows: Int[Array, " K"], start_row: Int[Array, ""] | int, place: Float[Array, "B 2"], dt: Float[Array, ""]
-) -> History:
-    """Rows of logged tracks; valid where the log is and the road user is at its logged place at `start_row`, or where the row before leads
-    (a perturbed start)."""
+) -> dict[str, Array]:
+    """Rows of logged tracks, by the names of `History`; valid where the log is and the road user is at its logged place at `start_row`, or
+    where the row before leads (a perturbed start)."""
     last = log.valid.shape[1] - 1
     start, before = jnp.clip(start_row, 0, last), jnp.clip(start_row - 1, 0, last)
     is_near = lambda logged: jnp.sum((logged - place) ** 2, axis=-1) < ON_LOG_M**2  # noqa: E731
@@ -112,14 +114,22 @@ def _read_rows(
     index = jnp.clip(rows, 0, last)
     pick = lambda table: jnp.moveaxis(table[:, index], 1, 0)  # noqa: E731
     valid = pick(log.valid) & ((rows >= 0) & (rows <= last))[:, None] & on_log
-    return History(pick(log.position), pick(log.yaw), pick(log.velocity), valid)
+    return {"position": pick(log.position), "yaw": pick(log.yaw), "velocity": pick(log.velocity), "valid": valid}
 
 
-def record(spec: HistorySpec | None, history: Any, motion: Motion, active: Bool[Array, " A"], boxes: Boxes, step: Int[Array, ""]) -> Any:
-    """Returns the history with the present state in front, if a row is due at this control step."""
+def record(
+    spec: HistorySpec | None,
+    history: Any,
+    motion: Motion,
+    active: Bool[Array, " A"],
+    boxes: Boxes,
+    step: Int[Array, ""],
+    action: Float[Array, "A 3"],
+) -> Any:
+    """Returns the history with the present state, and the action that led to it, in front, if a row is due at this control step."""
     if spec is None:
         return history
-    now = _join(motion, active, boxes)
+    now = _join(motion, active, boxes, action)
     moved = jax.tree.map(lambda new, old: jnp.concatenate([new[None], old[:-1]]), now, history)
     due = step % spec.stride == 0
     return jax.tree.map(lambda new, old: jnp.where(due, new, old), moved, history)
@@ -133,9 +143,9 @@ def restart(history: Any, starts: Bool[Array, " A"]) -> Any:
     return replace(history, valid=history.valid & ~jnp.pad(starts, (0, others)))
 
 
-def _join(motion: Motion, active: Bool[Array, " A"], boxes: Boxes) -> History:
+def _join(motion: Motion, active: Bool[Array, " A"], boxes: Boxes, action: Float[Array, "A 3"]) -> History:
     """One row, without its axis."""
     join = lambda cars, others: jnp.concatenate([cars, others])  # noqa: E731
     place, velocity = join(motion.position[:, :2], boxes.position), join(motion.velocity[:, :2], boxes.velocity)
     yaw, valid = join(motion.yaw, boxes.yaw), join(active, boxes.present)
-    return unchecked(History, position=place, yaw=yaw, velocity=velocity, valid=valid)
+    return unchecked(History, position=place, yaw=yaw, velocity=velocity, valid=valid, action=action)

@@ -26,6 +26,7 @@ from scenefactory_jax.learning.trainer import Trainer, TrainState, count_spawned
 from scenefactory_jax.loggers import metrics_csv
 
 LOG = logging.getLogger(__name__)
+YEAR_S = 31_557_600.0  # a Julian year
 OnIteration = Callable[[TrainState, Mapping[str, float | int]], None]
 MakeCallback = Callable[[Path, int | None], Callable[[Any, Mapping[str, float | int]], None] | None]
 
@@ -189,7 +190,7 @@ def _loop(
     """
     total, start = config["iterations"], first or 0
     file = metrics_csv.MetricsFile(folder, resume_at=first)
-    spent = file.rows[-1]["minutes"] if file.rows else 0.0
+    spent, years = (file.rows[-1].get(name, 0.0) if file.rows else 0.0 for name in ("minutes", "years"))
     with (
         interrupt.defer_interrupt() as get_signal,
         loggers.open_loggers(watching, folder, config, after=start) as log,
@@ -202,6 +203,8 @@ def _loop(
             spent += seconds / 60
             row = {"iteration": iteration, "minutes": spent, "steps/total": count_spawned_steps(state), **row, "seconds": seconds}
             row["casps"] = row["steps/spawned"] / seconds
+            row |= count_years(row, years, control_hz=config["timing"]["control_hz"])
+            years = row["years"]
             row |= {f"{name}_per_s": row[f"steps/{name}"] / seconds for name in ("updates", "samples") if f"steps/{name}" in row}
             file.add(row)
             log(row)
@@ -217,6 +220,12 @@ def _loop(
             if late:
                 break
     return state
+
+
+def count_years(row: Mapping[str, float | int], before: float, *, control_hz: float | int) -> dict[str, float]:
+    """Counts the years that active agents have driven since the run began, and those of this iteration in an hour of the clock."""
+    driven = row.get("steps/active", 0.0) / control_hz / YEAR_S
+    return {"years": before + driven, "years_per_hour": 3600.0 * driven / row["seconds"]}
 
 
 def check_finite(row: Mapping[str, float | int]) -> None:

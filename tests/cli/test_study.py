@@ -445,6 +445,8 @@ def steps_of(config):
 TIMED = {"vmax": "vmax", "plants": "vmax", "scenarionet": "scenarionet", "curriculum": "scenarionet"}  # study -> its protocol
 TIMED |= {"learners": "route100"}
 MANY = ("curriculum", "plants")  # environments
+STREAMED = "recipe_drive"  # trains on a mixture of banks and generated scenes
+WHOLE = [name for name in STUDIES if name not in (*TIMED, STREAMED)]
 TWINS = {"rewards_laptop", "network_laptop"}  # nearly the same variants as another study, for a CPU
 
 
@@ -479,7 +481,7 @@ def entry_minutes(entry):
     return next(float(word.partition("=")[2]) for word in entry["study"]["common"] if word.startswith("minutes="))
 
 
-@pytest.mark.parametrize("name", [pytest.param(n, marks=[pytest.mark.slow] if n in TWINS else []) for n in STUDIES if n not in TIMED])
+@pytest.mark.parametrize("name", [pytest.param(n, marks=[pytest.mark.slow] if n in TWINS else []) for n in WHOLE])
 def test_every_study_is_whole(name, tmp_path):
     """Every training and evaluation builds, and what is compared or drawn is evaluated."""
     entry = hydra_config.load_config("study", f"study={name}", f"runs={tmp_path}", "train_scenes=train.bank", "seeds=[0]")
@@ -491,6 +493,25 @@ def test_every_study_is_whole(name, tmp_path):
         environment.make_parts(built)
     assert name == "longer" or len({steps_of(one.config) for one in plan.trainings}) == 1  # as much experience for all
     assert {one.config["spawning"]["respawn_clearance_m"] for one in plan.evaluations} == {None}  # one life a car
+
+
+@pytest.mark.slow
+def test_a_study_of_a_mixture_is_whole(tmp_path):
+    """Every row takes one part of experiment=generalist away, judged with the same iterations; each comparison is with the recipe."""
+    entry = hydra_config.load_config("study", f"study={STREAMED}", f"runs={tmp_path}", "test_scenes=test.bank", "seeds=[0]")
+    plan = study_plan.make(study_plan.complete(entry))
+    study = entry["study"]
+    assert study["compare"] == [["recipe", name] for name in study["trainings"] if name != "recipe"]
+    assert len({one.digest for one in plan.trainings}) == len(study["trainings"])
+    for one in plan.trainings:
+        banks = one.config["stream"]["banks"]
+        assert one.config["scenes"]["path"] is None and banks == {name: entry["banks"][name] for name in ("womd", "womd_links")}
+    assert len({steps_of(one.config) for one in plan.trainings}) == 1
+    assert {one.condition for one in plan.evaluations if one.scores} == {"conflict"}
+    for built in {one.program: one.config for one in plan.evaluations if one.condition == "grip 0.15"}.values():
+        assert built["scenes"]["pack"]["starts"]["mu"] == built["weather"]["friction"]["surfaces"]["ICE"]["mu"] == 0.15
+    for one in {one.program: one for one in plan.trainings}.values():
+        environment.make_parts(one.config)
 
 
 def test_protocols_are_the_conditions_of_the_readmes_rows(tmp_path):

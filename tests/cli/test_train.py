@@ -43,7 +43,7 @@ from scenefactory_jax.visualization.report import evaluation_files, tables
 
 pytestmark = pytest.mark.usefixtures("quickly")
 
-CLOCK = {"seconds", "casps", "minutes"}  # columns that no two runs share
+CLOCK = {"seconds", "casps", "minutes", "years_per_hour"}  # columns that no two runs share
 
 
 def smoke(out, *overrides):
@@ -641,7 +641,7 @@ RUNS = (
 )
 
 
-SUITES = ("recorded_routes", "route100", "conflict", "conflict_reactive", "grip", "grip_hidden", "grip_stops")  # with routes
+SUITES = ("recorded_routes", "route100", "conflict", "conflict_reactive", "grip", "grip_hidden", "grip_stops", "ice_onset")  # with routes
 SUITES += ("vmax", "vmax_noise", "nuplan", "nuplan_reactive", "wosac", "scenarionet")
 
 

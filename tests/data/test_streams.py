@@ -20,7 +20,7 @@ from scenefactory_jax.core.instantiate import ConfigError, instantiate
 from scenefactory_jax.core.parallel import task_map
 from scenefactory_jax.core.raw_scene import SceneError
 from scenefactory_jax.data.bank import bank_reader
-from scenefactory_jax.data.loading import batches, samplers, scene_source, stream
+from scenefactory_jax.data.loading import batches, mixture, samplers, scene_source, stream
 from scenefactory_jax.learning import checkpoint
 from scenefactory_jax.learning.training_loop import train as run_train
 from scenefactory_jax.loggers import metrics_csv
@@ -31,7 +31,7 @@ pytestmark = pytest.mark.usefixtures("quickly")
 
 WORLDS = 8
 SHORT = ("stream.workers=0", "stream.sample=4", "stream.swap_fraction=0.5")
-CLOCK = {"seconds", "casps", "minutes", "stream/wait_s"}  # columns that no two runs share
+CLOCK = {"seconds", "casps", "minutes", "stream/wait_s", "years_per_hour"}  # columns that no two runs share
 
 
 def bits(tree):
@@ -150,6 +150,18 @@ def test_failing_scenes_come_more_often_in_proportion_to_failure():
     assert ((counts - expected) ** 2 / expected).sum() < 16.3  # chi-square with three degrees of freedom: 0.1 %
 
 
+def test_scenes_that_are_sometimes_mastered_come_more_often():
+    """No, a quarter, a half and all of 38 lives without success: draws beside those in turn are as p (1 - p)."""
+    kind = np.arange(400) % 4
+    failures = np.array([0.0, 9.5, 19.0, 38.0])[kind]
+    known, counts = table(np.zeros(400, int), np.full(400, 38.0), 38.0 - failures), np.zeros(4)
+    for trial in range(3000):
+        counts[kind[samplers.prioritize_learnable(known, 2, seed=trial, floor=0.5)[0]]] += 1
+    share = np.array([1.0, 10.5, 20.0, 39.0]) / 40
+    expected = 3000 * share * (1 - share) / (share * (1 - share)).sum()
+    assert ((counts - expected) ** 2 / expected).sum() < 16.3
+
+
 @pytest.mark.parametrize("floor", [0.25, 1.0])
 def test_failing_scenes_leave_draws_for_all_others(floor):
     """Whatever happens, every scene comes once in N / floor draws, again and again."""
@@ -218,7 +230,7 @@ def loader_of(found):
 
 
 def measured(loader, *, sample=8, **given):
-    return batches.measure(loader, sample=sample, headroom=1.0, given=given, seed=0)
+    return batches.measure(loader, sample=mixture.choose_sample(loader.source, (), sample, seed=0), headroom=1.0, given=given)
 
 
 def test_every_world_holds_the_scene_that_the_stream_says():

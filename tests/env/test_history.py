@@ -32,7 +32,8 @@ def test_a_row_is_kept_of_every_tenth_of_a_second():
     assert not kept.valid.any()
     for step in range(7):
         motion = replace(state.motion, position=jnp.full((2, 3), float(step)))
-        kept = record(kept, motion, state.active, scene.traffic, jnp.int32(step))
+        kept = record(kept, motion, state.active, scene.traffic, jnp.int32(step), jnp.full((2, 3), 0.1 * step))
+    np.testing.assert_allclose(kept.action[:, 0, 2], [0.6, 0.3, 0.0])
     np.testing.assert_array_equal(kept.position[:, 0, 0], [6.0, 3.0, 0.0])
     assert kept.valid.all()
     again = history.restart(kept, jnp.array([True, False]))
@@ -76,3 +77,36 @@ def test_an_environment_keeps_what_is_read():
 def test_control_steps_must_meet_the_tenths_of_a_second():
     with pytest.raises(ConfigError, match=r"timing.control_hz: expected a multiple of 10"):
         environment.make_parts(load_config("task", *BICYCLE, "observations=vmax_road", "timing.control_hz=25"))
+
+
+def test_a_car_reads_its_own_last_second():
+    """A car that brakes and turns: rows of velocity, its change, the turn and the action that led there; zeros before the start."""
+    config = load_config("train", "dynamics=bicycle", "observations=drive_blind", "spawning=logged")
+    groups = config["observations"]
+    assert groups["weather"] is None and groups["friction_ahead"] is None  # what would tell the friction
+    env = environment.make_env({**config, "observations": {"motion": groups["motion"]}})
+    scene, action, driven = scene_of([[0.0, 0.0]], [[50.0, 0.0]], speeds=[8.0]), jnp.array([[-1.0, 0.5, 0.6]]), []
+    state, observation = jax.jit(env.reset)(jax.random.key(0), scene)
+    assert observation["motion"].shape == (1, 93) and not observation["motion"].any()
+    step = jax.jit(env.step)
+    for _ in range(3):
+        driven.append(state)
+        state, result = step(scene, state, action)
+    last, rows = np.split(np.asarray(result.observation["motion"])[0], [3])
+    rows = rows.reshape(10, 9)
+    np.testing.assert_allclose(last, state.previous_action[0])
+    np.testing.assert_array_equal(rows[:, -1], [1.0] * 3 + [0.0] * 7)
+    assert not rows[3:].any() and not rows[2, 5:8].any() and (rows[:2, 7] > 0).all()  # no action led to the start
+    speeds, yaws = (np.array([float(get(one)) for one in [*driven, state]]) for get in (read_speed, lambda one: one.motion.yaw[0]))
+    np.testing.assert_allclose(rows[:3, 0], speeds[2::-1] * np.cos(read_slip(driven))[::-1] / 10.0, rtol=1e-4)
+    np.testing.assert_allclose(rows[:3, 4], np.diff(yaws)[::-1] / 0.1, rtol=1e-3, atol=1e-5)
+    assert (rows[:3, 2] < -0.5).all()  # brakes of 60 % slow it by more than 2.5 m/s^2
+
+
+def read_speed(state):
+    return jnp.hypot(*state.motion.velocity[0, :2])
+
+
+def read_slip(states):
+    """The angle between the heading and the velocity."""
+    return np.array([float(jnp.arctan2(one.motion.velocity[0, 1], one.motion.velocity[0, 0]) - one.motion.yaw[0]) for one in states])

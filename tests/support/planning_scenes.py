@@ -92,6 +92,7 @@ def state_of(scene: Scene, *, speed=(5.0, 8.0), step=3, past=4, control_dt=0.1) 
         yaw=join(rows(agents.yaw), rows(boxes.yaw)),
         velocity=join(rows(velocity), rows(boxes.velocity)),
         valid=join(rows(agents.present), rows(boxes.present)),
+        action=jnp.zeros((past, count, 3)),
     )
     return State(
         body=None,

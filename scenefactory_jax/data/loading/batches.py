@@ -59,11 +59,11 @@ class Batch(NamedTuple):
     refused: dict[str, str]  # scene -> reason
 
 
-def measure(loader: BatchLoader, *, sample: int, headroom: float, given: Mapping[str, int | None], seed: int) -> dict[str, int]:
+def measure(loader: BatchLoader, *, sample: Sequence[int] | np.ndarray, headroom: float, given: Mapping[str, int | None]) -> dict[str, int]:
     """Computes the sizes of all worlds: as given, or those of the largest of a sample of scenes and some more.
 
     Args:
-        sample: scenes to measure, sampled with the seed.
+        sample: entries to measure.
         headroom: factor on what varies from scene to scene: segments, traffic, grid.
         given: size -> rows; None: measured.
 
@@ -74,8 +74,7 @@ def measure(loader: BatchLoader, *, sample: int, headroom: float, given: Mapping
     valid, source = (*AXES, *spatial_grid.SIZES), loader.source
     if unknown := [name for name in given if name not in valid]:
         raise ConfigError(f"stream.capacity.{unknown[0]}: unknown; valid: {', '.join(valid)}")
-    indices = range(sample) if source.count is None else np.random.default_rng(seed).permutation(source.count)[:sample]
-    found = list(loader.each(functools.partial(_measure_scene, grid=loader.grid), indices))
+    found = list(loader.each(functools.partial(_measure_scene, grid=loader.grid), sample))
     needs = [need for need in found if isinstance(need, dict)]
     if not needs:
         raise SceneError(f"{source.description}: not one of {len(found)} can be used: {'; '.join(map(str, found[:SHOWN]))}")

@@ -14,7 +14,7 @@ from jaxtyping import Float, Int
 from scenefactory_jax.core.scene_arrays import wrap_angles
 from scenefactory_jax.core.schema import Bounds, ConfigError, Count, NonNegative
 from scenefactory_jax.core.types import Scene
-from scenefactory_jax.data.loading.samplers import SceneOutcomes
+from scenefactory_jax.data.loading.samplers import SceneOutcomes, take_rows
 
 SPACING_M = 1.0  # between points of a track at which its direction is read: noise of a standing car's place is no bend
 MOVED_M = 1.0  # a road user this far from its first place has moved
@@ -72,11 +72,6 @@ def sort_into_levels(difficulty: Float[np.ndarray, " N"], levels: int) -> Int[np
     for level, rows in enumerate(np.array_split(usable[np.argsort(difficulty[usable], kind="stable")], levels)):
         found[rows] = level
     return found
-
-
-def take_rows(table: SceneOutcomes, rows: Int[np.ndarray, " M"]) -> SceneOutcomes:
-    """The table of some scenes alone."""
-    return dataclasses.replace(table, **{name: getattr(table, name)[rows] for name in ("draws", "episodes", "successes")})
 
 
 class Levels:

@@ -35,6 +35,11 @@ def empty(scenes: int | None) -> SceneOutcomes:
     return SceneOutcomes(np.zeros(count, int), np.zeros(count), np.zeros(count), endless=scenes is None)
 
 
+def take_rows(table: SceneOutcomes, rows: Int[np.ndarray, " M"]) -> SceneOutcomes:
+    """The table of some scenes alone."""
+    return replace(table, **{name: getattr(table, name)[rows] for name in ("draws", "episodes", "successes")})
+
+
 def count_draws(table: SceneOutcomes, indices: Draws) -> SceneOutcomes:
     """The table after these draws; an endless one grows by those beyond it."""
     if table.endless:
@@ -78,12 +83,24 @@ def prioritize_failures(table: SceneOutcomes, count: int, *, seed: int, floor: A
     Args:
         floor: in (0, 1]; 1 ignores failures, at 0 some scenes would never be drawn.
     """
+    return _prioritize(table, count, seed=seed, floor=floor, weigh=lambda failure: failure)
+
+
+def prioritize_learnable(table: SceneOutcomes, count: int, *, seed: int, floor: Annotated[float, Bounds(above=0, max=1)]) -> Draws:
+    """As `prioritize_failures`, but by p (1 - p) of the fraction p of episodes without success: scenes that agents sometimes master.
+
+    Scenes that no agent can master, as starts in a collision, take no draws from the others. Rutherford et al. 2024 (arXiv:2408.15099).
+    """
+    return _prioritize(table, count, seed=seed, floor=floor, weigh=lambda failure: failure * (1.0 - failure))
+
+
+def _prioritize(table: SceneOutcomes, count: int, *, seed: int, floor: float, weigh: Callable[[np.ndarray], np.ndarray]) -> Draws:
     before = int(table.draws.sum())
     rng = np.random.default_rng((seed, before))
     driven = np.flatnonzero(table.episodes > 0)
     in_turn = int(np.floor((before + count) * floor) - np.floor(before * floor))
-    failure = (table.episodes[driven] - table.successes[driven] + 1.0) / (table.episodes[driven] + 2.0)
-    chosen = rng.choice(driven, min(count - in_turn, len(driven)), replace=False, p=failure / failure.sum()) if len(driven) else driven
+    weight = weigh((table.episodes[driven] - table.successes[driven] + 1.0) / (table.episodes[driven] + 2.0))
+    chosen = rng.choice(driven, min(count - in_turn, len(driven)), replace=False, p=weight / weight.sum()) if len(driven) else driven
     rest = count - len(chosen)
     if table.endless:
         return np.concatenate([chosen, np.arange(len(table.draws), len(table.draws) + rest)])

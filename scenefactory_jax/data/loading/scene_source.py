@@ -38,18 +38,19 @@ Pack = Callable[[RawScene], tuple[Any, Any]]
 class SceneSource:
     """Entries that can be read in any order: scenes of a bank, files, or indices of a generator."""
 
-    kind: Literal["bank", "files", "generator"]
+    kind: Literal["bank", "files", "generator", "mixture"]
     description: str  # for messages
     count: int | None  # entries; None: endless
     name: Callable[[int], str]  # of an entry, printable
     reader: Callable[[int], Read]  # of an entry: one scene or reject, of a file also several
     files: int  # that the scenes came from
     rejects: tuple[dict[str, Any], ...] = ()  # of the conversion that made the bank
+    parts: Mapping[str, Any] = field(default_factory=dict)  # name -> identity of the sources of a mixture
 
     @property
     def identity(self) -> dict[str, Any]:
         """Values that a resumed run compares."""
-        return {"kind": self.kind, "entries": self.count}
+        return {"kind": self.kind, "entries": self.count} | ({"parts": dict(self.parts)} if self.parts else {})
 
     def read(self, *, limit: int | None = None) -> Iterator[RawScene | Reject]:
         """All scenes before checks and packing, and a reject in place of each that cannot be read; SceneError for a damaged bank."""
@@ -72,10 +73,14 @@ def _read_one(name: str, read: Read) -> RawScene:
 
 def open_source(config: Mapping[str, Any]) -> SceneSource:
     """The source of a `scenes` config: `path`, or the generator with `seed`."""
-    path = config["path"]
-    if path is None:
+    if config["path"] is None:
         return open_generator(make_generator(config), seed=config["seed"])
-    return open_bank(path) if bank_index.is_bank(path) else open_files(path, reader_selection.make(config["formats"]))
+    return open_path(config["path"], reader_selection.make(config["formats"]))
+
+
+def open_path(path: Path | str, formats: Mapping[str, reader_selection.Reader]) -> SceneSource:
+    """The source of a bank's scenes, of a file's, or of all files below a folder."""
+    return open_bank(path) if bank_index.is_bank(path) else open_files(path, formats)
 
 
 def open_bank(bank: bank_reader.Bank | Path | str) -> SceneSource:

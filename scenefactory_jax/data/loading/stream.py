@@ -35,9 +35,9 @@ from scenefactory_jax.core.raw_scene import SceneError
 from scenefactory_jax.core.safe_names import escape_for_terminal
 from scenefactory_jax.core.schema import Bounds, Count, Fraction, Positive, Seed
 from scenefactory_jax.core.types import Scene
-from scenefactory_jax.data.loading import batches, samplers
+from scenefactory_jax.data.loading import batches, mixture, samplers
 from scenefactory_jax.data.loading.batches import Batch, BatchLoader
-from scenefactory_jax.data.loading.curriculum import Curriculum, Levels, compute_difficulty, sort_into_levels, take_rows
+from scenefactory_jax.data.loading.curriculum import Curriculum, Levels, compute_difficulty, sort_into_levels
 from scenefactory_jax.data.loading.scene_source import SceneSource, make_packing, open_source
 from scenefactory_jax.data.loading.scenes_config import check_config
 
@@ -61,6 +61,8 @@ class StreamConfig:
     memory_gib: Positive
     capacity: dict[str, int | None]
     curriculum: Curriculum | None = None
+    banks: dict[str, str | None] = dataclasses.field(default_factory=dict)
+    shares: dict[str, float | None] | None = None
 
 
 class PlacedScenes(NamedTuple):
@@ -81,9 +83,10 @@ class SceneStream:
         swapped: int,
         load: Callable[[np.ndarray], Future[PlacedScenes]],
         state: Mapping[str, Any],
+        parts: tuple[mixture.Part, ...] = (),
     ):
-        """`swapped`: worlds that get other scenes at once; `state`: of `state()`, or `_make_state`."""
-        self.swapped = swapped
+        """`swapped`: worlds that get other scenes at once; `state`: of `state()`, or `_make_state`; `parts`: of a mixture."""
+        self.swapped, self._parts = swapped, parts
         self._source, self._settings, self._sampler, self._load = source, settings, sampler, load
         columns = {name: np.asarray(state[name], kind) for name, kind in (("draws", int), ("episodes", float), ("successes", float))}
         self._table = samplers.SceneOutcomes(**columns, endless=source.count is None)
@@ -142,6 +145,7 @@ class SceneStream:
                 self.draw()
         waited, self._waited_s = self._waited_s, 0.0
         counts = {f"stream/{name}": count for name, count in self._counts.items()}
+        row |= mixture.summarise_parts(self._count_outcomes(), self._parts)
         return {"stream/scenes": int((self._table.draws > 0).sum()), **counts, "stream/wait_s": waited, **row}
 
     def state(self) -> dict[str, Any]:
@@ -165,7 +169,7 @@ class SceneStream:
     def _sample(self, count: int) -> np.ndarray:
         """The sampler's next scenes, of a curriculum's level; the outcomes include those of the running worlds."""
         table, rows = self._count_outcomes(), None if self._levels is None else self._levels.rows
-        table = table if rows is None else take_rows(table, rows)
+        table = table if rows is None else samplers.take_rows(table, rows)
         indices = np.asarray(self._sampler(table, count))
         limit = np.inf if table.endless else len(table.draws)
         if indices.shape != (count,) or indices.dtype.kind not in "iu" or (indices < 0).any() or (indices >= limit).any():
@@ -192,9 +196,9 @@ class SceneStream:
         return placed
 
 
-def _make_state(source: SceneSource, sizes: Mapping[str, int], worlds: int) -> dict[str, Any]:
-    """The state of a stream at its start."""
-    table = samplers.empty(source.count)
+def _make_state(source: SceneSource, sizes: Mapping[str, int], worlds: int, *, known: int) -> dict[str, Any]:
+    """The state of a stream at its start; `known`: entries of which there are outcomes from the start on."""
+    table = samplers.empty(known)
     return {
         "source": source.identity,
         "sizes": dict(sizes),
@@ -245,7 +249,8 @@ def open_stream(config: Mapping[str, Any], *, mesh: Mesh | None, before: Mapping
         raise ConfigError(f"scenes.take.count: {count}; a stream samples from all scenes: `scenes op=select` makes a smaller bank")
     sampler = instantiate(settings.sampler, builtins=samplers, where="stream.sampler", seed=config["seed"])
     swapped = min(worlds, int(np.ceil(settings.swap_fraction * worlds / devices)) * devices)  # an equal part on every device
-    source = open_source(config["scenes"])
+    source, parts = _open(config["scenes"], settings)
+    sampler = mixture.share_draws(sampler, parts, seed=config["seed"]) if parts else sampler
     if settings.curriculum is not None and source.count is None:  # levels need all scenes: of a generator the first ones
         source = dataclasses.replace(source, count=config["scenes"]["count"])
     if before is not None and before["source"] != source.identity:
@@ -256,8 +261,9 @@ def open_stream(config: Mapping[str, Any], *, mesh: Mesh | None, before: Mapping
         task_map = stack.enter_context(open_pool(settings.workers))
         loader = BatchLoader(source, **make_packing(config["scenes"]), grid=config["scenes"]["road_grid"], task_map=task_map)
         if before is None:
-            measure = functools.partial(batches.measure, loader, sample=settings.sample, headroom=settings.headroom)
-            before = _make_state(source, measure(given=settings.capacity, seed=config["seed"]), worlds)
+            sample = mixture.choose_sample(source, parts, settings.sample, seed=config["seed"])
+            sizes = batches.measure(loader, sample=sample, headroom=settings.headroom, given=settings.capacity)
+            before = _make_state(source, sizes, worlds, known=mixture.count_known(source, parts))
             if settings.curriculum is not None:
                 before["curriculum"] = _make_levels(loader, settings.curriculum)
         sizes = before["sizes"]
@@ -269,9 +275,20 @@ def open_stream(config: Mapping[str, Any], *, mesh: Mesh | None, before: Mapping
 
         rows = ", ".join(f"{rows} {name}" for name, rows in sizes.items())
         LOG.info(f"stream of {source.description}: {swapped} of {worlds} worlds an iteration, each of {rows}")
-        yield SceneStream(source, settings, sampler, swapped, lambda indices: thread.submit(load, indices), before)
+        yield SceneStream(source, settings, sampler, swapped, lambda indices: thread.submit(load, indices), before, parts)
+
+
+def _open(scenes: Mapping[str, Any], settings: StreamConfig) -> tuple[SceneSource, tuple[mixture.Part, ...]]:
+    """The source of a stream, and its parts if it is a mixture."""
+    if settings.shares is None:
+        return open_source(scenes), ()
+    if settings.curriculum is not None:
+        raise ConfigError("stream.curriculum: expected null beside stream.shares; prioritize_failures draws what fails within each share")
+    return mixture.open_mixture(scenes, settings.banks, settings.shares)
 
 
 def _format(identity: Mapping[str, Any]) -> str:
     kind, entries = identity["kind"], identity["entries"]
+    if "parts" in identity:
+        return ", ".join(f"{name}: {_format(part)}" for name, part in identity["parts"].items())
     return "scenes of a generator" if kind == "generator" else f"{entries} {'files' if kind == 'files' else 'scenes of a bank'}"

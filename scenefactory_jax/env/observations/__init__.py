@@ -19,6 +19,7 @@ from scenefactory_jax.env.observations.lane_vector import lane
 from scenefactory_jax.env.observations.leader_vector import leader
 from scenefactory_jax.env.observations.log_view import log
 from scenefactory_jax.env.observations.metadrive import metadrive
+from scenefactory_jax.env.observations.motion_history import motion_history
 from scenefactory_jax.env.observations.neighbour_sets import closest_approach, neighbours
 from scenefactory_jax.env.observations.noise_vector import noise
 from scenefactory_jax.env.observations.planning import planning
@@ -44,7 +45,7 @@ __all__ += [
     "signs",
     "weather",
 ]  # groups
-__all__ += ["log", "noise", "planning", "yaw_rate_and_steer"]
+__all__ += ["log", "motion_history", "noise", "planning", "yaw_rate_and_steer"]
 __all__ += ["metadrive", "vmax_base", "vmax_lane", "vmax_road", "vmax_segment"]
 
 Group = Callable[[Scene, State], Any]  # a vector [A, F], a SetObservation or, for planners, another pytree of arrays [A, ...]

@@ -1,0 +1,165 @@
+"""The table of targets: every protocol on every set of scenes, for planners and for the runs of one recipe or more.
+
+python -m experiments.drive.table --scenes womd_test=BANK womd_links_test=BANK towns=null --runs ours=runs/g-0,runs/g-1,runs/g-2
+    [--planners log pure_pursuit idm_route pdm_closed] [--rows strict route100] [--overrides scenes.workers=8]
+
+Runs of one name are its seeds, evaluated by one program: brackets are 95 % intervals over seeds, scenes and agents, of planners over
+scenes. What an earlier call measured is kept in `--kept` and read again, so that a stopped call goes on, and new runs cost only themselves.
+Writes `table.md` and `table.json`.
+"""
+
+import argparse
+import time
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from experiments.drive import evaluations
+from experiments.drive.evaluations import Asked
+from scenefactory_jax.core import config as run_config
+from scenefactory_jax.core import markdown, result_file
+from scenefactory_jax.data.loading import scene_source
+from scenefactory_jax.evaluation import statistics
+from scenefactory_jax.evaluation.records import Records, select_rows
+
+HERE = Path(__file__).parent
+TOWNS = ("scenes.heldout.path=null", "scenes.heldout.seed=2000000", "scenes.heldout.count=64")  # as in experiments/suites
+AMONG = ("traffic=log_playback", "scenes.pack.traffic=64")
+PLANNERS = ("log", "pure_pursuit", "route_pursuit", "idm_route", "pdm_closed")
+RECORDED = "log"  # has no way on drawn routes, and no log to follow among traffic that reacts
+
+
+class Number(NamedTuple):
+    """A line of the table."""
+
+    label: str
+    metric: str
+    aim: str
+    select: Callable[[Records], dict[str, np.ndarray]] = dict  # the records that it is of
+
+
+class Row(NamedTuple):
+    """An evaluation and what is read from it."""
+
+    protocol: tuple[str, ...]
+    overrides: tuple[str, ...]
+    numbers: tuple[Number, ...]
+    has_log: bool = True
+    scored: bool = False
+
+
+def count_events(records: Records) -> dict[str, np.ndarray]:
+    """The records with any of collision, edge and tip-over in the column `collision`."""
+    return dict(records) | {"collision": records["collision"] | records["road_edge_contact"] | records["out_of_bounds"]}
+
+
+def select_use(records: Records) -> dict[str, np.ndarray]:
+    """The agents of the suite grip that enter at u = 0.8."""
+    return select_rows(records, np.isclose(records["friction_use"], 0.8))
+
+
+def _make_grip(mu: float, aim: str) -> Row:
+    number = Number(f"`grip`: clean at u = 0.8, mu {mu:g}", "clean_completion_rate", aim, select_use)
+    return Row(("protocol=grip", f"protocol.mu={mu:g}"), (), (number,), has_log=False)
+
+
+ROWS = {
+    "strict": Row(("protocol=strict",), (), (
+        Number("`strict`: goal without any event", "clean_success_rate", ">= 98 %"),
+        Number("the same on bends", "clean_bend_rate", ">= 92 %"),
+        Number("events in all (collision, edge, tip-over)", "collision_rate", "<= 0.8 %", count_events),
+    )),
+    "among": Row(("protocol=strict",), AMONG, (
+        Number("`strict` among played-back traffic: clean", "clean_success_rate", ">= 94 %"),
+        Number("the same: collisions", "collision_rate", "<= 3 %"),
+    )),
+    "paper": Row(("protocol=paper",), (), (Number("from rest (`paper`): collisions", "collision_rate", "<= 1 %"),), has_log=False),
+    "route100": Row(("protocol=route100",), (), (
+        Number("`route100`: clean completion", "clean_completion_rate", ">= 90 %"),
+        Number("`route100`: collisions per 100 km", "collisions_per_100_km", "<= 5"),
+    ), has_log=False),
+    **{f"grip_{mu:g}": _make_grip(mu, aim) for mu, aim in ((1.0, ">= 90 %"), (0.6, ">= 90 %"), (0.3, ">= 80 %"), (0.15, ">= 60 %"))},
+    "conflict": Row(("protocol=conflict",), (), (
+        Number("`conflict`: at-fault collisions", "at_fault_collision", "<= 1.5 %"), Number("`conflict`: collisions", "collision_rate", ""),
+    ), scored=True),
+    "conflict_reactive": Row(("protocol=conflict_reactive",), (), (
+        Number("`conflict_reactive`: at-fault collisions", "at_fault_collision", "<= 1 %"),
+    ), has_log=False, scored=True),
+    "vmax": Row(("protocol=vmax",), (), (Number("V-Max score", "vmax_score", ">= 0.90"),), scored=True),
+    "nuplan": Row(("protocol=nuplan",), (), (Number("nuPlan score", "nuplan_score", ">= 0.90"),), scored=True),
+    "recorded_routes": Row(("protocol=recorded_routes",), (), (Number("red lights run", "red_light_rate", "<= 0.5 %"),)),
+}  # fmt: skip
+
+
+def measure(row: Row, runs: tuple[str, ...], planner: str | None, scenes: str, given: argparse.Namespace) -> dict[str, Any]:
+    """Measures the numbers of a row: label -> estimate; a number that nothing has is left out."""
+    towns = TOWNS if scenes == "null" else ()
+    asked = Asked(runs, planner, row.protocol, (*row.overrides, *towns, *given.overrides), None if scenes == "null" else scenes)
+    found, numbers = evaluations.evaluate(asked, given.kept), {}
+    for number in row.numbers:
+        chosen = {seed: number.select(records) for seed, records in found.items()}
+        summarise = statistics.summarise_runs if len(chosen) > 1 else lambda runs, **how: statistics.summarise(runs[0], **how)
+        if len(chosen[0]["scene"]) and number.metric in (estimates := summarise(chosen, bootstrap=given.bootstrap, seed=0)):
+            numbers[number.label] = estimates[number.metric]._asdict() | {"runs": len(chosen)}
+    return numbers
+
+
+def write_report(result: Mapping[str, Any], path: Path) -> Path:
+    """Writes one table a set of scenes: lines are the targets, columns who drives."""
+    about = "One episode a scene; brackets are 95 % intervals, over seeds, scenes and agents for several runs, else over scenes."
+    lines = ["# Targets", "", about, ""]
+    for name, drivers in result["sets"].items():
+        rows = []
+        for row in ROWS.values():
+            for number in row.numbers:
+                cells = [_format(estimates.get(number.label)) for estimates in drivers.values()]
+                rows += [[number.label, number.aim, *cells]] if any(cells) else []
+        header = ["", "aim", *(f"{driver} ({count} runs)" if (count := result["runs"].get(driver)) else driver for driver in drivers)]
+        lines += [f"## {name}", "", markdown.format_table(header, rows), ""]
+    path.write_text("\n".join([*lines, f"`{result['command']}`", ""]))
+    return path
+
+
+def _format(estimate: Mapping[str, Any] | None) -> str:
+    if estimate is None or estimate["value"] is None:
+        return ""
+    scale, digits, unit = (100.0, 1, " %") if estimate["unit"] == "fraction" else (1.0, 2, "")
+    show = lambda value: f"{scale * value:.{digits}f}"  # noqa: E731
+    return show(estimate["value"]) + unit + ("" if estimate["low"] is None else f" [{show(estimate['low'])}, {show(estimate['high'])}]")
+
+
+def main() -> None:
+    """Reads the command line, evaluates what is missing and writes the table after every row."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--runs", nargs="*", default=[], help="NAME=FOLDER,FOLDER...")
+    parser.add_argument("--scenes", nargs="+", required=True, help="NAME=PATH; PATH null: 64 towns that no training has seen")
+    parser.add_argument("--planners", nargs="*", choices=PLANNERS, default=[])
+    parser.add_argument("--rows", nargs="*", choices=list(ROWS), default=list(ROWS))
+    parser.add_argument("--overrides", nargs="*", default=[])
+    parser.add_argument("--bootstrap", type=int, default=2000)
+    parser.add_argument("--kept", type=Path, default=Path("runs/table"))
+    parser.add_argument("--out", type=Path, default=HERE)
+    given = parser.parse_args()
+    scene_source.use_compilation_cache()
+    given.out.mkdir(parents=True, exist_ok=True)
+    runs = {name: tuple(folders) for name, folders in evaluations.parse_runs(given.runs).items()}
+    drivers = {**{planner: ((), planner) for planner in given.planners}, **{name: (folders, None) for name, folders in runs.items()}}
+    command = " ".join(["python -m experiments.drive.table --runs", *given.runs, "--scenes", *given.scenes, "--planners", *given.planners])
+    result: dict[str, Any] = {"command": command, "runs": {name: len(folders) for name, folders in runs.items()}, "sets": {}}
+    for name, (path,) in evaluations.parse_runs(given.scenes).items():
+        for row_name in given.rows:
+            for driver, (folders, planner) in drivers.items():
+                before, row = time.monotonic(), ROWS[row_name]
+                kept = result["sets"].setdefault(name, {}).setdefault(driver, {})
+                if planner != RECORDED or row.has_log:
+                    kept.update(measure(row, folders, planner, path, given))
+                    print(f"{name}, {row_name}, {driver}: {time.monotonic() - before:.0f} s", flush=True)
+            result_file.write(given.out / "table.json", result | {"versions": run_config.versions()}, digits=5)
+            write_report(result_file.read(given.out / "table.json"), given.out / "table.md")
+    print(given.out / "table.md")
+
+
+if __name__ == "__main__":
+    main()
