@@ -46,7 +46,7 @@ def convert(config: Mapping[str, Any]) -> Summary:
         refine=functools.partial(conversion.complete, check=packing["check"], rebuild=rebuild, gate=gate),
         features=None if features is None else instantiate(features, builtins="scenefactory_jax.data.bank.catalogue", where="features"),
     )
-    source = config["source"]
+    source: Any = config["source"]
     if generates:
         source = conversion.Generated(scene_source.make_generator(scenes), scenes["seed"], scenes["count"])
     with Progress(disable=not config["progress"]) as bar:
