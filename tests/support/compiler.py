@@ -17,9 +17,9 @@ os.environ.setdefault(
     + " --xla_cpu_use_fusion_emitters=false" * (tuple(map(int, version("jaxlib").split(".")[:2])) < (0, 11)),
 )
 # What one test compiled, the other worker, the notebook's kernel, the processes that tests start and later runs on this machine find: a
-# program's name there is its code, XLA's flags and version. `make clean` removes all, a week what no run has read.
+# program's name there is its code, XLA's flags and version. What no run has read for a week is removed.
 if "JAX_COMPILATION_CACHE_DIR" not in os.environ:
-    COMPILED = Path(__file__).resolve().parents[2] / ".pytest_cache" / "compiled" / platform.node()
+    COMPILED = Path.home() / ".cache" / "scenefactory_jax" / "tests" / platform.node()
     for file in COMPILED.glob("*"):
         with contextlib.suppress(FileNotFoundError):  # another run's turn
             if file.stat().st_atime < time.time() - 7 * 24 * 3600:
