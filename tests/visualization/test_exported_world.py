@@ -49,13 +49,6 @@ def scene_with(*starts):
     return scene_of(columns[:, :2], columns[:, :2] + 50.0, yaws=columns[:, 2], speeds=columns[:, 3])
 
 
-@pytest.fixture(scope="module")
-def straight(tmp_path_factory):
-    """Surface -> a world of one car at 10 m/s on it, which none changes."""
-    folders = {name: tmp_path_factory.mktemp(name) for name in ("ice", "dry")}
-    return {name: export(folders[name], scene_with((0, 0, 0, 10)), weather) for name, weather in {"ice": ICE, "dry": DRY}.items()}
-
-
 def opened(world):
     return exported_drives.load_script(world), *exported_drives.load_script(world).open_world(str(world))
 
@@ -94,12 +87,14 @@ def test_the_script_is_short_and_needs_mujoco_and_numpy_alone():
     assert {name for name in names if name not in sys.stdlib_module_names} == {"mujoco", "numpy"}
 
 
-def test_braking_distance_follows_the_sampled_friction(straight):
-    distance = {}
-    for name, world in straight.items():
+def test_braking_distance_follows_the_sampled_friction(tmp_path):
+    speed, distance = 8.0, {}
+    for name, weather in {"ice": ICE, "dry": DRY}.items():
+        (tmp_path / name).mkdir()
+        world = export(tmp_path / name, scene_with((0, 0, 0, speed)), weather)
         model = mujoco.MjModel.from_xml_path(str(world))
         mu = model.pair("agent0/ground_front_left").friction[0]
-        distance[name] = drive_alone(world, "--drive", 0, 0, 1, 12)["agent0/"][0] / (10.0**2 / (2 * mu * G))
+        distance[name] = drive_alone(world, "--drive", 0, 0, 1, 10)["agent0/"][0] / (speed**2 / (2 * mu * G))
     assert 0.95 < distance["ice"] < 1.05 and 1.0 < distance["dry"] < 1.1, distance
 
 
@@ -131,9 +126,9 @@ def test_the_exported_car_drives_like_the_package(tmp_path):
     assert 0.0 < distance.max() < validation["bound"]["bound_m"]
 
 
-def test_the_viewer_steps_with_the_forces_of_the_script(straight, monkeypatch):
+def test_the_viewer_steps_with_the_forces_of_the_script(tmp_path, monkeypatch):
     """All but the window."""
-    world, final = straight["dry"], []
+    world, final = export(tmp_path, scene_with((0, 0, 0, 12)), DRY), []
 
     def launch(model, data):
         for _ in range(120):
@@ -153,8 +148,9 @@ def test_the_viewer_steps_with_the_forces_of_the_script(straight, monkeypatch):
     np.testing.assert_array_equal(final[0], data.qpos)
 
 
+@pytest.mark.slow  # the driving, the friction of patches and the parameters of cars that differ: tests above and below, one by one
 def test_a_world_with_patches_and_cars_that_differ_drives_like_the_environment(tmp_path):
-    config = settings("weather=split", "dynamics/randomization=spread") | {"observations": {}, "reward": {}}
+    config = settings("weather=split", "dynamics/randomization=spread")
     scene = scene_with((-40, 1, 0, 12), (-10, -2, 0.1, 8), (20, 0, 2.5, 5))
     env, actions = environment.make_env(config), jnp.array([[0.6, 0.2, 0.0], [0.0, -0.1, 0.8], [0.3, 0.3, 0.0]], jnp.float32)
     key = jax.random.split(jax.random.split(jax.random.key(0), 1)[0])[1]  # as `sample_start`
@@ -290,10 +286,11 @@ def test_patches_change_the_friction_under_each_wheel(tmp_path):
 # ---- plain MuJoCo
 
 
-def test_a_plain_step_accelerates_steers_and_brakes(straight):
+def test_a_plain_step_accelerates_steers_and_brakes(tmp_path):
     distance = {}
-    for name, world in straight.items():
-        model = mujoco.MjModel.from_xml_path(str(world))
+    for name, weather in {"ice": ICE, "dry": DRY}.items():
+        (tmp_path / name).mkdir()
+        model = mujoco.MjModel.from_xml_path(str(export(tmp_path / name, scene_with((0, 0, 0, 10)), weather)))
         data = mujoco.MjData(model)
         mujoco.mj_resetDataKeyframe(model, data, 0)
         data.actuator("agent0/brake").ctrl = 1.0
