@@ -11,15 +11,15 @@ from support import composing
 from support.running import SHARED, quick_compilation
 
 LONGEST = (  # files that take longest, by CPU time: started first, or one worker would end with one of them alone
-    "test_train", "test_study", "test_traffic_pool", "test_policy_traffic", "test_environment", "test_exported_world", "test_digests",
-    "test_validation_run", "test_film", "test_benchmark",
-    "test_scoring", "test_planners", "test_planner_evaluation", "test_vmax_golden", "test_wosac_golden",
-    "test_randomization", "test_traffic", "test_adapters", "test_troubleshooting", "test_adapters_gymnasium", "test_pretrained",
-    "test_adversary", "test_dynamics", "test_record", "test_recorded_samples", "test_copo",
-    "test_patches_and_rain", "test_banks", "test_gpu_processes", "test_contact_solver", "test_episode_metrics", "test_pdm_closed",
-    "test_ppo", "test_learners", "test_train_learners", "test_equations_of_motion", "test_collision", "test_extension", "test_tyres",
-    "test_optimization", "test_sharding", "test_unvectorised_baseline", "test_failures", "test_fault_isolation", "test_operations",
-    "test_docs", "test_actuators", "test_route_following", "test_idm_traffic", "test_streams", "test_inputs",
+    "test_train", "test_study", "test_policy_traffic", "test_sharding", "test_environment", "test_digests", "test_wosac_protocol",
+    "test_learners", "test_planner_evaluation", "test_validation_run", "test_film", "test_randomization", "test_benchmark",
+    "test_exported_world", "test_adversary", "test_traffic", "test_record", "test_traffic_pool", "test_train_learners", "test_encoders", "test_adversarial",
+    "test_pretrained", "test_heads", "test_dynamics", "test_patches_and_rain", "test_collision", "test_planners", "test_scoring",
+    "test_vmax_golden", "test_wosac_golden", "test_adapters", "test_troubleshooting", "test_adapters_gymnasium",
+    "test_equations_of_motion", "test_optimization", "test_recorded_samples", "test_copo", "test_banks", "test_gpu_processes",
+    "test_contact_solver", "test_episode_metrics", "test_pdm_closed", "test_failures", "test_ppo", "test_idm_traffic", "test_extension",
+    "test_tyres", "test_unvectorised_baseline", "test_fault_isolation", "test_flags", "test_operations", "test_docs", "test_actuators",
+    "test_route_following", "test_streams", "test_inputs", "test_opendrive", "test_drive", "test_attention_kernel",
 )  # fmt: skip
 
 composing.share()

@@ -20,9 +20,21 @@ def test_a_shared_composition_is_hydras(words, monkeypatch):
     for _ in range(2):  # composed, and handed out again
         shared = composing.compose_once(name, overrides)
     monkeypatch.setattr(composing.ConfigRepository, "load_config", composing.load_config)
+    monkeypatch.setattr(composing.defaults_list, "_create_interpolation_map", composing.map_choices)
     expected = composing.compose(name, overrides)
     shared, expected = hydra_config.to_dict(shared), hydra_config.to_dict(expected)
     assert shared == expected and repr(shared) == repr(expected)  # in the same order
+
+
+def test_compositions_read_a_file_once(monkeypatch):
+    files, load_config = [], composing.load_config
+    monkeypatch.setattr(composing, "FILES", {})
+    monkeypatch.setattr(composing, "GROUPS", {})
+    monkeypatch.setattr(composing, "load_config", lambda self, config_path: files.append(config_path) or load_config(self, config_path))
+    for weather in ("wet", "ice"):
+        composing.compose_once("task", [f"weather={weather}"])
+    own = [file for file in files if (hydra_config.find_conf() / f"{file}.yaml").is_file()]
+    assert {"weather/wet", "weather/ice", "weather/base"} < {*own} and len(own) == len({*own})
 
 
 def test_a_changed_file_is_read_anew(tmp_path):

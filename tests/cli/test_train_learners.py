@@ -78,10 +78,22 @@ def test_the_expert_of_a_run_follows_the_log(tmp_path):
         expert.make_expert(config | {"learner": config["learner"] | {"expert": {"_target_": "nothing"}}})
 
 
+GAIL = ("learner=gail", "spawning=logged", "dynamics=bicycle", "learner.expert_steps=8", "learner.batch=64", "learner.buffer=512")
+
+
+def test_one_word_makes_gail(tmp_path):
+    """The expert of the config drives, the discriminator reads the policy's observations. Traced, not compiled: tests/learning learns."""
+    parts, state, after, metrics = trace(smoke(tmp_path / "run", *GAIL))
+    assert jax.tree.structure(after) == jax.tree.structure(state) and after.buffer["gail"].rows["action"].shape[1] == 512
+    assert {"gail/buffer", "gail/skipped", "gail/reward", "gail/loss", "reward", "reward/progress", "ppo/skipped"} <= metrics.keys()
+    mean, _, value = jax.eval_shape(parts.policy.apply, state.parameters, state.worlds.observation)
+    assert mean.shape == (4, 4, 3) and value.shape == (4, 4)
+
+
+@pytest.mark.slow  # the same, compiled
 def test_one_word_trains_gail(tmp_path):
     """The expert drives in the first iteration; the environment's reward is still reported, the policy's is the discriminator's."""
-    small = ("learner.expert_steps=8", "learner.batch=64", "learner.buffer=512", "iterations=1", "evaluation.enable=false")
-    run = train(smoke(tmp_path / "run", "learner=gail", "spawning=logged", "dynamics=bicycle", *small))
+    run = train(smoke(tmp_path / "run", *GAIL, "iterations=1", "evaluation.enable=false"))
     [row] = run.metrics
     assert row["gail/buffer"] > 0 and row["gail/skipped"] == row["ppo/skipped"] == 0.0
     assert row["gail/reward"] > 0.0 and row["gail/loss"] == pytest.approx(2 * np.log(2), abs=0.7)
@@ -89,13 +101,17 @@ def test_one_word_trains_gail(tmp_path):
     jax.tree.map(np.testing.assert_array_equal, trained.parameters, get_policy_parameters(run.state))
 
 
-def test_one_word_makes_copo(tmp_path):
-    """The learner asks the policy for three values, of which no evaluation reads one. It is traced, not compiled."""
-    config = smoke(tmp_path / "run", "learner=copo")
+def trace(config):
+    """Parts of a training, and shapes of its state before and after an iteration and of the metrics."""
     parts = training_loop.prepare(config)
     stage, _ = scene_source.assign_scenes(scene_source.load_training_scenes(config["scenes"]), 4, seed=0, mesh=None)
     state = jax.eval_shape(parts.trainer.init, jax.random.key(0), stage)
-    after, metrics = jax.eval_shape(parts.trainer.train_iteration, state, stage)
+    return parts, state, *jax.eval_shape(parts.trainer.train_iteration, state, stage)
+
+
+def test_one_word_makes_copo(tmp_path):
+    """The learner asks the policy for three values, of which no evaluation reads one. It is traced, not compiled."""
+    parts, state, after, metrics = trace(smoke(tmp_path / "run", "learner=copo"))
     assert jax.tree.structure(after) == jax.tree.structure(state) and after.buffer["copo"].shape == (4, 4)
     assert {"copo/lcf_mean", "copo/lcf_std", "ppo/explained_variance", "copo/explained_variance_global"} <= metrics.keys()
     mean, _, value = jax.eval_shape(parts.policy.apply, state.parameters, state.worlds.observation)

@@ -51,17 +51,18 @@ def test_rewards_equal_their_definitions():
     other = make_pairs([0.5, -1.0, 0.5], [1.0, 2.0, 9.0], [True, True, False], [-0.3, 0.8, -0.3])
     for name in ("gail", "airl"):
         judge = make_discriminator(name)
-        parameters = judge.init(jax.random.key(0), {"cue": jnp.ones((1, 3, 1))})
-        score = judge.score(parameters, pairs)
+        parameters, find_score = jax.jit(judge.init)(jax.random.key(0), {"cue": jnp.ones((1, 3, 1))}), jax.jit(judge.score)
+        score = np.asarray(find_score(parameters, pairs))
         probability = 1 / (1 + np.exp(-np.asarray(score, float)))
-        np.testing.assert_array_equal(score, judge.score(parameters, other))
+        np.testing.assert_array_equal(score, find_score(parameters, other))
         assert score[0] != score[2]
         if name == "gail":
             np.testing.assert_allclose(judge.reward(score), -np.log(1 - probability), rtol=1e-5)
             continue
         network = airl.make_value(POLICY.encoder, hidden=[16], activation="tanh")
-        reward, shaping = (functools.partial(network.apply, parameters[part]) for part in ("reward", "shaping"))
-        f = reward(pairs.observation) + GAMMA * shaping(pairs.next_observation) * np.array([1, 1, 0]) - shaping(pairs.observation)
+        reward, shaping = (functools.partial(jax.jit(network.apply), parameters[part]) for part in ("reward", "shaping"))
+        now, then, base = map(np.asarray, (reward(pairs.observation), shaping(pairs.next_observation), shaping(pairs.observation)))
+        f = now + GAMMA * then * np.array([1, 1, 0]) - base
         density = np.exp(np.array([-0.3, 0.8, -0.3]))
         np.testing.assert_allclose(probability, np.exp(f) / (np.exp(f) + density), rtol=1e-5)
         np.testing.assert_allclose(judge.reward(score), np.log(probability) - np.log(1 - probability), rtol=1e-4)
@@ -72,7 +73,7 @@ def test_it_tells_two_distributions_apart(name):
     """States around 1 are the expert's, around -1 the policy's; D in between is the ratio of their densities, here sigmoid(2 x / 0.5^2)."""
     learner = make_learner_constants(name)
     judge = learner.discriminator
-    parameters = judge.init(jax.random.key(0), {"cue": jnp.ones((1, 3, 1))})
+    parameters = jax.jit(judge.init)(jax.random.key(0), {"cue": jnp.ones((1, 3, 1))})
     learnt = off_policy.Learnt(parameters, (), learner.optimizer.init(parameters))
 
     @jax.jit
@@ -86,7 +87,7 @@ def test_it_tells_two_distributions_apart(name):
     learnt, metrics = run(learnt, jax.random.key(1))
     assert metrics["expert_accuracy"][-50:].mean() > 0.95 and metrics["policy_accuracy"][-50:].mean() > 0.95
     middle = np.array([-0.3, 0.0, 0.3])
-    np.testing.assert_allclose(judge.score(learnt.parameters, make_pairs(middle)), 8 * middle, atol=0.8)
+    np.testing.assert_allclose(jax.jit(judge.score)(learnt.parameters, make_pairs(middle)), 8 * middle, atol=0.8)
 
 
 def make_learner_constants(name):
@@ -119,7 +120,7 @@ def test_the_policy_does_as_the_expert_from_what_is_observed(course, name):
     state = learner.init(jax.random.key(0), stage)
     for _ in range(ITERATIONS):
         state, metrics = learner.train_iteration(state, stage)
-    action = POLICY.apply(get_policy_parameters(state), {"cue": jnp.array([[-1.0, 0.0], [1.0, 0.0]])})[0]
+    action = jax.jit(POLICY.apply)(get_policy_parameters(state), {"cue": jnp.array([[-1.0, 0.0], [1.0, 0.0]])})[0]
     np.testing.assert_allclose(action[:, 0], [-0.5, 0.5], atol=0.2)
     assert all(np.isfinite(float(value)) for value in metrics.values()) and metrics[f"{name}/skipped"] == 0.0
     assert float(metrics["reward"]) == 1.0 != float(metrics[f"{name}/reward"])

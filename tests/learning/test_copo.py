@@ -24,7 +24,7 @@ from scenefactory_jax.learning.trainer import get_policy_parameters
 
 pytestmark = pytest.mark.usefixtures("quickly")
 
-WORLDS = 16
+WORLDS, APPLY = 16, jax.jit(POLICY.apply)
 
 
 def test_rewards_of_others():
@@ -112,7 +112,7 @@ def train_on(learner, task, iterations):
         state, metrics = learner.train_iteration(state, stage)
 
     def look(*cues):
-        mean, _, value = POLICY.apply(get_policy_parameters(state), {"cue": jnp.array(cues, jnp.float32)[:, None]})
+        mean, _, value = APPLY(get_policy_parameters(state), {"cue": np.array(cues, np.float32)[:, None]})
         return mean[:, 0], value
 
     return state, jax.device_get(metrics), look

@@ -33,41 +33,50 @@ POLICY: dict[str, Any] = {
     "observation_groups": {},
 }
 OBSERVATION = observe(0)
-ACTION = jnp.asarray(np.random.default_rng(1).normal(size=(2, 3, 2)), jnp.float32)
+ACTION = jax.device_put(np.random.default_rng(1).normal(size=(2, 3, 2)).astype(np.float32))
 
 
 @pytest.fixture(scope="module", params=["lq", "late_fusion"])
 def critic(request):
+    """The network, its parameters, and its values and their gradients as a compiled function."""
     network = heads.make_critic(encoding.make_encoder(request.param), 2, **HEAD)
-    parameters = jax.jit(network.init)(jax.random.key(0), OBSERVATION, ACTION)
-    return network, encoding.shake(parameters), parameters
+
+    def first(parameters, action):
+        values = network.apply(parameters, OBSERVATION, action)
+        return jnp.sum(values[0]), values
+
+    return network, encoding.draw(network, OBSERVATION, ACTION), jax.jit(jax.grad(first, (0, 1), has_aux=True))
 
 
 def test_critics_share_no_weight(critic):
-    network, parameters, drawn = critic
-    values = jax.jit(network.apply)(parameters, OBSERVATION, ACTION)
+    _, parameters, derive = critic
+    (gradient, by_action), values = jax.device_get(derive(parameters, ACTION))
     assert values.shape == (2, 2, 3)
-    gradient = jax.jit(jax.grad(lambda p, a: jnp.sum(network.apply(p, OBSERVATION, a)[0]), (0, 1)))(parameters, ACTION)
-    for path, leaf in jax.tree.leaves_with_path(gradient[0]):
+    for path, leaf in jax.tree.leaves_with_path(gradient):
         assert np.any(leaf[0]) and not np.any(leaf[1]), path
-    assert np.any(gradient[1]), "a critic reads the action"
-    kernels = [leaf for path, leaf in jax.tree.leaves_with_path(drawn) if path[-1].key == "kernel"]
-    assert len(kernels) > 3 and all(np.any(leaf[0] != leaf[1]) for leaf in kernels)
+    assert np.any(by_action), "a critic reads the action"
 
 
 def test_each_critic_is_the_network_alone(critic):
-    network, parameters, _ = critic
-    values = jax.jit(network.apply)(parameters, OBSERVATION, ACTION)
+    _, parameters, derive = critic
+    values = np.asarray(derive(parameters, ACTION)[1])
     for index in range(2):
-        twice = jax.tree.map(lambda leaf, index=index: jnp.stack([leaf[index]] * 2), parameters)
-        np.testing.assert_allclose(jax.jit(network.apply)(twice, OBSERVATION, ACTION)[0], values[index], atol=1e-5)
+        twice = jax.tree.map(lambda leaf, index=index: np.stack([leaf[index]] * 2), parameters)
+        np.testing.assert_allclose(derive(twice, ACTION)[1][0], values[index], atol=1e-5)
+
+
+def test_critics_begin_with_other_weights():
+    network = heads.make_critic(encoding.make_encoder("mlp"), 2, **HEAD)
+    drawn = jax.device_get(jax.jit(network.init)(jax.random.key(0), OBSERVATION, ACTION))
+    kernels = [leaf for path, leaf in jax.tree.leaves_with_path(drawn) if path[-1].key == "kernel"]
+    assert len(kernels) > 3 and all(np.any(leaf[0] != leaf[1]) for leaf in kernels)
 
 
 def test_a_head_equals_plain_arithmetic():
     """No activation after the last hidden layer: 256 - ReLU - 64 - ReLU - 32 - outputs."""
     network = heads.make_actor(encoding.make_encoder("none"), 4, **HEAD)
-    parameters = encoding.shake(jax.jit(network.init)(jax.random.key(0), {"ego": OBSERVATION["ego"]}))
-    p = jax.device_get(parameters)["params"]["head"]
+    parameters = encoding.draw(network, {"ego": OBSERVATION["ego"]})
+    p = parameters["params"]["head"]
     layer = lambda name, x: x @ p[name]["kernel"] + p[name]["bias"]  # noqa: E731
     expected = layer("last", layer("layer_1", np.maximum(layer("layer_0", np.asarray(OBSERVATION["ego"])), 0.0)))
     raw = jax.jit(network.apply)(parameters, {"ego": OBSERVATION["ego"]})
@@ -89,15 +98,15 @@ def test_values_are_one_number_an_agent_and_kernels_are_lecuns():
 
 @pytest.mark.parametrize("shared", [False, True])
 def test_an_encoder_is_shared_only_on_demand(shared):
-    policy = actor_critic.make(encoder={"_target_": "lq", **ENTRIES["lq"]}, **{**POLICY, "shared_encoder": shared})
+    policy = actor_critic.make(encoder={"_target_": "mlp", **ENTRIES["mlp"]}, **{**POLICY, "shared_encoder": shared})
     drawn = jax.jit(policy.init)(jax.random.key(0), OBSERVATION)
     mean, log_std, value = jax.jit(policy.apply)(drawn, OBSERVATION)
     assert mean.shape == (2, 3, 3) and value.shape == (2, 3)
     np.testing.assert_allclose(mean, np.broadcast_to([0.5, 0.0, -1.0], mean.shape), atol=0.05)
     np.testing.assert_array_equal(log_std, np.full(3, -0.5, np.float32))
-    derive = jax.jit(jax.grad(lambda p, part: jnp.sum(policy.apply(p, OBSERVATION)[part]), 0), static_argnums=1)
-    touched = {part: {name for name, leaves in derive(encoding.shake(drawn), part)["params"].items() if np.any(jax.tree.leaves(leaves)[0])}
-               for part in (0, 2)}  # fmt: skip
+    derive = jax.jit(jax.jacrev(lambda p: jnp.stack([jnp.sum(policy.apply(p, OBSERVATION)[part]) for part in (0, 2)])))
+    slopes = jax.device_get(derive(encoding.draw(policy, OBSERVATION)))["params"]
+    touched = {part: {name for name, leaves in slopes.items() if np.any(jax.tree.leaves(leaves)[0][row])} for row, part in ((0, 0), (1, 2))}
     names = ("encoder", "encoder") if shared else ("actor_encoder", "critic_encoder")
     assert touched == {0: {names[0], "actor_head"}, 2: {names[1], "critic_head"}}
 
@@ -129,7 +138,7 @@ def with_neighbours(env):
     return env._replace(observe=observe)
 
 
-SLOW = ("late_fusion", "lqh", "wayformer")
+SLOW = ("none", "late_fusion", "lqh", "mtr", "wayformer")  # gradients of each: test_encoders
 SHORT = {"lq": {"rounds": 1}, "wayformer": {"depth": 1}}
 
 

@@ -106,37 +106,46 @@ def test_losses_of_cloning_equal_their_definitions():
 
 @pytest.fixture(scope="module")
 def course():
-    """Learner -> its policy and its trainer on the probes, compiled once."""
-    return functools.lru_cache(lambda name: make_learner(name, probe()))
+    """Learner -> its policy, its trainer on the probes, and (state, two cues) -> (action, values of both critics); compiled once."""
+
+    @functools.cache
+    def make(name):
+        policy, learner = make_learner(name, probe())
+
+        @jax.jit
+        def look(parameters, critics, cues):
+            action = policy.apply(parameters, {"cue": cues})[0]
+            found = [policy.networks.critic.apply(one, {"cue": cues}, action[:, :2]) for one in critics]
+            return action, found[0] if found else None
+
+        return policy, learner, lambda state, cues: look(
+            get_policy_parameters(state), [one.critics for one in state.learner.values() if one], cues
+        )
+
+    return make
 
 
 def train_on(course, name, task, iterations):
     """The train state, metrics of the last iteration, and (action, values of both critics) for cues."""
-    policy, learner = course(name)
+    _, learner, ask = course(name)
     stage, metrics = scenes(WORLDS, task), {}
     state = learner.init(jax.random.key(0), stage)
     for _ in range(iterations):
         state, metrics = learner.train_iteration(state, stage)
 
-    def look(*cues):
-        observation = {"cue": jnp.array(cues, jnp.float32)[:, None]}
-        action = policy.apply(get_policy_parameters(state), observation)[0]
-        found = [policy.networks.critic.apply(one.critics, observation, action[:, :2]) for one in state.learner.values() if one]
-        return action, found[0] if found else None
-
-    return state, jax.device_get(metrics), look
+    return state, jax.device_get(metrics), lambda *cues: jax.device_get(ask(state, np.array(cues, np.float32)[:, None]))
 
 
 @pytest.mark.parametrize("name", ["sac", "td3"])
 def test_probes_1_to_3_values(course, name):
-    np.testing.assert_allclose(train_on(course, name, 1, 30)[2](0.0)[1], [[1.0], [1.0]], atol=0.05)
+    np.testing.assert_allclose(train_on(course, name, 1, 30)[2](0.0, 0.0)[1], np.ones((2, 2)), atol=0.05)
     np.testing.assert_allclose(train_on(course, name, 2, 40)[2](-1.0, 1.0)[1], [[-1.0, 1.0]] * 2, atol=0.05)
     np.testing.assert_allclose(train_on(course, name, 3, 40)[2](0.0, 1.0)[1], [[0.9, 1.0]] * 2, atol=0.06)  # alpha pays for entropy
 
 
 @pytest.mark.parametrize("name", ["sac", "td3"])
 def test_probe_4_action(course, name):
-    np.testing.assert_allclose(train_on(course, name, 4, 40)[2](0.0)[0][:, 0], [0.5], atol=0.12)
+    np.testing.assert_allclose(train_on(course, name, 4, 40)[2](0.0, 0.0)[0][:, 0], [0.5, 0.5], atol=0.12)
 
 
 @pytest.mark.parametrize("name", list(LEARNERS))
@@ -154,8 +163,7 @@ def test_probe_5_action_that_depends_on_the_observation(course, name):
 
 @pytest.mark.parametrize("name", list(LEARNERS))
 def test_a_killed_and_resumed_run_is_the_unbroken_one(course, name, tmp_path):
-    _, learner = course(name)
-    stage = scenes(WORLDS)
+    learner, stage = course(name)[1], scenes(WORLDS)
     unbroken, _ = check_resumed_is_unbroken(learner, stage, tmp_path)
     parameters = checkpoint.restore_parameters(tmp_path / "0")
     jax.tree.map(np.testing.assert_array_equal, parameters, get_policy_parameters(unbroken))
@@ -188,13 +196,14 @@ def test_samples_of_empty_slots_and_of_the_time_limit_are_not_stored(life, lengt
 
 
 def test_critics_are_independent_and_targets_follow_them(course):
-    policy, learner = course("sac")
+    policy, learner, _ = course("sac")
     stage = scenes(WORLDS)
     before = jax.device_get(learner.init(jax.random.key(0), stage).learner["sac"])
     for leaf in jax.tree.leaves(before.critics):
         assert leaf.shape[0] == 2 and (not leaf.any() or (leaf[0] != leaf[1]).any())  # biases begin as zeros
     observation, action = {"cue": jnp.ones((1, 1))}, jnp.zeros((1, 2))
-    slope = jax.grad(lambda critics: policy.networks.critic.apply(critics, observation, action)[0].sum())(before.critics)
+    derive = jax.jit(jax.grad(lambda critics: policy.networks.critic.apply(critics, observation, action)[0].sum()))
+    slope = jax.device_get(derive(before.critics))
     assert not any(leaf[1].any() for leaf in jax.tree.leaves(slope)) and any(leaf[0].any() for leaf in jax.tree.leaves(slope))
     moved = off_policy.move_towards({"x": jnp.float32(1.0)}, {"x": jnp.float32(3.0)}, 0.25)
     assert float(moved["x"]) == 1.5
@@ -209,13 +218,13 @@ def test_the_actor_of_td3_waits():
     cue = {"cue": jnp.ones((1, 4, 1))}
     one = jnp.ones((1, 4))
     rows = {"observation": cue, "next_observation": cue, "action": jnp.zeros((1, 4, 2)), "reward": one, "follows": one}
-    learnt = [learner.init(jax.random.key(0), policy.init(jax.random.key(1), cue), cue)]
+    learnt = [jax.jit(lambda key: learner.init(key, policy.init(key, cue), cue))(jax.random.key(0))]
     step = jax.jit(learner.update)
     for index in range(3):
         learnt.append(step(learnt[-1], rows, one, jax.random.key(index))[0])
 
     def stays(pick):
-        same = lambda one, other: all(bool((a == b).all()) for a, b in zip(*map(jax.tree.leaves, (pick(one), pick(other))), strict=True))  # noqa: E731
+        same = lambda *both: all((a == b).all() for a, b in zip(*(jax.tree.leaves(jax.device_get(pick(one))) for one in both), strict=True))  # noqa: E731
         return [same(one, other) for one, other in itertools.pairwise(learnt)]
 
     for pick in (lambda x: x.parameters, lambda x: x.learner.target, lambda x: x.learner.target_actor):
@@ -228,7 +237,7 @@ def test_an_update_that_is_not_finite_changes_nothing():
     cue = {"cue": jnp.ones((1, 4, 1))}
     rows = {"observation": cue, "next_observation": cue, "action": jnp.zeros((1, 4, 2)), "follows": jnp.ones((1, 4))}
     learner = sac.make_learner(policy, schema.read(LEARNERS["sac"] | {"entropy_target": -1.0}, SACConfig, where="learner"), None)
-    learnt = learner.init(jax.random.key(0), policy.init(jax.random.key(1), cue), cue)
+    learnt = jax.jit(lambda key: learner.init(key, policy.init(key, cue), cue))(jax.random.key(0))
     step = jax.jit(learner.update)
     after, metrics = step(learnt, rows | {"reward": jnp.array([[1.0, jnp.nan, 1.0, 1.0]])}, jnp.ones((1, 4)), jax.random.key(2))
     assert not metrics["changed"]

@@ -36,6 +36,7 @@ from scenefactory_jax.evaluation import circumstances
 from scenefactory_jax.learning import checkpoint, policy_io, policy_traffic
 
 pytestmark = pytest.mark.usefixtures("quickly")
+PLAIN = ("dynamics=bicycle", "~reward", "+reward={}")  # of agents of which only what they see and hit counts
 
 
 @pytest.fixture(scope="module")
@@ -120,8 +121,8 @@ def test_the_policy_sees_agents_as_its_own_see_cars(agents, tiny, alone):
 
 
 def test_agents_see_and_hit_the_vehicles(folder):
-    config = smoke("unused", "traffic=policy", f"traffic.run={folder}", "spawning=logged", "step_metrics.collision_grace_steps=0")
-    env = sf.make(config)
+    config = smoke("unused", "traffic=policy", f"traffic.run={folder}", "spawning=logged", "step_metrics.collision_grace_steps=0", *PLAIN)
+    env = sf.make(config | {"observations": {"neighbours": config["observations"]["neighbours"]}})
     agents = scene_of([[-15.0, 0.5], [0.0, 40.0]], [[40.0, 0.5], [9.0, 40.0]])
     scene = replace(street(), agents=agents.agents, log=agents.log)
     state, observation = jax.jit(env.reset)(jax.random.key(0), scene)

@@ -9,21 +9,21 @@ import os
 import pickle
 
 import yaml
+from hydra._internal import defaults_list
 from hydra._internal.config_loader_impl import ConfigLoaderImpl
 from hydra._internal.config_repository import ConfigRepository
-from hydra._internal.core_plugins.file_config_source import FileConfigSource
 from hydra.core.override_parser.overrides_parser import OverridesParser
 
 from scenefactory_jax.cli import hydra_config
 
-compose, load_config = hydra_config._compose, ConfigRepository.load_config
+compose, load_config, map_choices = hydra_config._compose, ConfigRepository.load_config, defaults_list._create_interpolation_map
 FILES, GROUPS = {}, {}  # pickled: what is handed out is a copy
 
 
 def read_once(self, config_path):
     """In place of `ConfigRepository.load_config`: the parsed file as long as its time of change stays the same."""
     source = next((one for one in self.sources if one.is_config(config_path)), None)
-    if not isinstance(source, FileConfigSource):
+    if source is None or source.scheme() != "file":  # no isinstance: Hydra imports the module of its sources a second time
         return load_config(self, config_path)
     file = os.path.join(source.path, source._normalize_file_name(config_path))
     stat = os.stat(file)
@@ -31,6 +31,13 @@ def read_once(self, config_path):
     if key not in FILES:
         FILES[key] = pickle.dumps(load_config(self, config_path))
     return pickle.loads(FILES[key])
+
+
+def map_choices_if_read(overrides, defaults, self_added):
+    """In place of `_create_interpolation_map`, whose result only an option like `${dynamics}` in the list of defaults reads."""
+    if any(not one.is_self() and one.is_interpolation() for one in defaults):
+        return map_choices(overrides, defaults, self_added)
+    return None
 
 
 def compose_once(name, overrides, *, whole=False):
@@ -53,3 +60,4 @@ def share():
     """For all of a process. YAML is read by the same rules in C, which is what OmegaConf's loader then derives from."""
     yaml.SafeLoader = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
     ConfigRepository.load_config, hydra_config._compose = read_once, compose_once
+    defaults_list._create_interpolation_map = map_choices_if_read

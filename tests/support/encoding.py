@@ -1,9 +1,9 @@
 """Encoders and observations at toy size."""
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
+from scenefactory_jax.core.pytree import unchecked
 from scenefactory_jax.core.types import SetObservation
 from scenefactory_jax.learning.networks import heads
 
@@ -30,13 +30,13 @@ def make_encoder(name, *, groups=None, dtype="float32", **changes):
 def observe(seed, batch=(2, 3)):
     """A vector and two sets of this project; agent (0, 0) sees no row."""
     rng = np.random.default_rng(seed)
-    normal = lambda *shape: jax.device_put(rng.normal(size=shape).astype(np.float32))  # noqa: E731
+    normal = lambda *shape: rng.normal(size=shape).astype(np.float32)  # noqa: E731
     sets = {}
     for name, rows, features in (("neighbours", 4, 5), ("road", 5, 3)):
         mask = rng.random((*batch, rows)) < 0.6
         mask[(0,) * len(batch)] = False
-        sets[name] = SetObservation(normal(*batch, rows, features), jax.device_put(mask))
-    return {"ego": normal(*batch, 7), **sets}
+        sets[name] = unchecked(SetObservation, features=normal(*batch, rows, features), mask=mask)
+    return jax.device_put({"ego": normal(*batch, 7), **sets})
 
 
 def observe_vmax(seed, batch=(2, 3)):
@@ -50,11 +50,13 @@ def observe_vmax(seed, batch=(2, 3)):
         block[..., -1:] = valid
         parts.append(block.reshape(*batch, -1))
     parts.append(rng.normal(size=(*batch, 8)))
-    return {"vmax": jnp.asarray(np.concatenate(parts, axis=-1), jnp.float32)}
+    return {"vmax": jax.device_put(np.concatenate(parts, axis=-1).astype(np.float32))}
 
 
-def shake(parameters, seed=0):
-    """Parameters with random numbers added: at first encoders with ReZero do not see their observation."""
-    leaves, tree = jax.tree.flatten(parameters)
+def draw(network, *inputs, seed=0):
+    """Parameters with random numbers in all of them, as an encoder with ReZero sees its observation only then. Drawn here, since
+    compiling what the network itself draws takes longer than all else."""
     rng = np.random.default_rng(seed)
-    return jax.tree.unflatten(tree, [leaf + jnp.asarray(0.3 * rng.normal(size=leaf.shape), jnp.float32) for leaf in leaves])
+    scale = lambda shape: 0.4 if len(shape) < 2 else min(0.4, shape[-2] ** -0.5)  # noqa: E731
+    shapes = jax.eval_shape(network.init, jax.random.key(0), *inputs)
+    return jax.tree.map(lambda leaf: (scale(leaf.shape) * rng.normal(size=leaf.shape)).astype(leaf.dtype), shapes)

@@ -52,6 +52,10 @@ def fill(name, devices):
     }
 
 
+def learn_on_each(name):
+    """What is learnt on one device and on two."""
+    return [(fill if name == "recorded" else learn)(name, devices) for devices in (1, 2)]
+
+
 if __name__ == "__main__":
-    task = fill if sys.argv[1] == "recorded" else learn
-    print("RESULT", json.dumps([task(name, devices) for name in sys.argv[1].split(",") for devices in (1, 2)]), flush=True)
+    print("RESULT", json.dumps(learn_on_each(sys.argv[1])), flush=True)

@@ -1,8 +1,9 @@
 """Runs in processes of its own: a few iterations of PPO on so many devices in so many shards; prints what was learnt as JSON.
 
-    python sharding.py DEVICES:SHARDS[:PAST][,DEVICES:SHARDS ...] [COORDINATOR PROCESSES INDEX]
+    python sharding.py DEVICES:SHARDS[:PAST][,DEVICES:SHARDS ...][,LEARNER ...] [COORDINATOR PROCESSES INDEX]
 
-PAST: of two past policies, which the probe reads, the newest replaces the oldest every so many iterations.
+PAST: of two past policies, which the probe reads, the newest replaces the oldest every so many iterations. LEARNER: of `learner_sharding`,
+in the same process, which spares another one's start.
 """
 
 import itertools
@@ -20,6 +21,7 @@ from scenefactory_jax.core import sharding
 from scenefactory_jax.learning import past_policies
 from scenefactory_jax.learning.networks import late_fusion
 from scenefactory_jax.learning.trainer import get_policy_parameters
+from support import learner_sharding
 from support.probes import SMALL, make_trainer, probe, probe_with_past, scenes
 
 WORLDS = 8
@@ -64,4 +66,6 @@ def learn(devices, shards, every=None):
 
 
 if __name__ == "__main__":
-    print("RESULT", json.dumps([learn(*map(int, pair.split(":"))) for pair in sys.argv[1].split(",")]), flush=True)
+    words = sys.argv[1].split(",")
+    found = [learn(*map(int, word.split(":"))) if word[0].isdigit() else learner_sharding.learn_on_each(word) for word in words]
+    print("RESULT", json.dumps(found), flush=True)

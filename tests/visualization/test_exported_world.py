@@ -148,6 +148,7 @@ def test_the_viewer_steps_with_the_forces_of_the_script(tmp_path, monkeypatch):
     np.testing.assert_array_equal(final[0], data.qpos)
 
 
+@pytest.mark.slow  # the driving, the friction of patches and the parameters of cars that differ: tests above and below, one by one
 def test_a_world_with_patches_and_cars_that_differ_drives_like_the_environment(tmp_path):
     config = settings("weather=split", "dynamics/randomization=spread")
     scene = scene_with((-40, 1, 0, 12), (-10, -2, 0.1, 8), (20, 0, 2.5, 5))
