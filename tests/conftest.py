@@ -13,7 +13,8 @@ from support.running import SHARED, quick_compilation
 LONGEST = (  # files that take longest, by CPU time: started first, or one worker would end with one of them alone
     "test_train", "test_study", "test_policy_traffic", "test_sharding", "test_environment", "test_digests", "test_wosac_protocol",
     "test_learners", "test_planner_evaluation", "test_validation_run", "test_film", "test_randomization", "test_benchmark",
-    "test_exported_world", "test_adversary", "test_traffic", "test_record", "test_traffic_pool", "test_train_learners", "test_encoders", "test_adversarial",
+    "test_exported_world",
+    "test_adversary", "test_traffic", "test_record", "test_traffic_pool", "test_train_learners", "test_encoders", "test_adversarial",
     "test_pretrained", "test_heads", "test_dynamics", "test_patches_and_rain", "test_collision", "test_planners", "test_scoring",
     "test_vmax_golden", "test_wosac_golden", "test_adapters", "test_troubleshooting", "test_adapters_gymnasium",
     "test_equations_of_motion", "test_optimization", "test_recorded_samples", "test_copo", "test_banks", "test_gpu_processes",
