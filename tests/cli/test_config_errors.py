@@ -163,7 +163,7 @@ def test_an_unknown_key_or_option_is_named_with_the_valid_ones(override, message
 
 
 def test_an_unknown_config_is_named():
-    with pytest.raises(ConfigError, match=r"config: expected one of benchmark, compare, convert, .*train.*, got 'fly'"):
+    with pytest.raises(ConfigError, match=r"config: expected one of attack, benchmark, compare, convert, .*train.*, got 'fly'"):
         hydra_config.load_config("fly")
 
 

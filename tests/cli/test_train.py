@@ -320,7 +320,7 @@ def test_other_settings_of_a_run(whole, tmp_path):
     for override, message in {
         "overrides=[timing.episode=1]": "timing.episode: the run has no 'episode' there; valid: control_hz, episode_s, physics_hz",
         "overrides=[wether=wet]": "the run has no 'wether' there; valid: .*weather",
-        "overrides=[weather=foggy]": "Could not find 'weather/foggy' Available options in 'weather': base .* dry .* mixed .* wet",
+        "overrides=[weather=foggy]": "Could not find 'weather/foggy' Available options in 'weather': all base .* dry .* mixed .* wet",
         "protocol.termination=[perhaps]": r"protocol\.termination: expected one or more of goal_only, .*, got \['perhaps'\]",
     }.items():
         with pytest.raises(ConfigError, match=message):
