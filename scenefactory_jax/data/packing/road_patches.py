@@ -29,7 +29,7 @@ def attach_patches(scene: Scene, reports: Sequence[PackReport]) -> Scene:
         reports: of the scenes, in their order.
 
     Raises:
-        SceneError: an entry that is none, with the scene's name.
+        SceneError: an entry that is not a patch, with the scene's name.
     """
     entries = [report.metadata.get(KEY) or [] for report in reports]
     if not (count := max(map(len, entries), default=0)):
