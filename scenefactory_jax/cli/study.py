@@ -60,7 +60,7 @@ def study(config: Mapping[str, Any]) -> dict[str, Any]:
         if config["processes"] == 1:
             done = _run(part, plan, Session(config, uses, TaskClaims(None), deadline))
         else:
-            done = _run_in_processes(part, config, uses, deadline)
+            done = _run_in_processes(part, plan, config, uses, deadline)
         if not done:
             print("stopped at the time limit; the same command continues", flush=True)
             break
@@ -69,12 +69,13 @@ def study(config: Mapping[str, Any]) -> dict[str, Any]:
     return study_results.write(plan, config, out, before=uses.read_result())
 
 
-def _run_in_processes(part: str, config: Mapping[str, Any], uses: "HeldOutUses", deadline: float) -> bool:
+def _run_in_processes(part: str, plan: Plan, config: Mapping[str, Any], uses: "HeldOutUses", deadline: float) -> bool:
     """Runs one part in several processes, `per_gpu` on each GPU, and returns whether all of it was done."""
+    processes, per_gpu = config["processes"], config["per_gpu"]
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         try:
-            done = gpu_processes.run_on_gpus(_run_claimed, config["processes"], part, config, folder, deadline, per_gpu=config["per_gpu"])
+            done = gpu_processes.run_on_gpus(_run_claimed, processes, part, plan, config, folder, deadline, per_gpu=per_gpu)
         finally:
             for file in sorted(folder.glob("*-uses.json")):
                 for use in result_file.read(file)["held_out_uses"]:
@@ -82,11 +83,11 @@ def _run_in_processes(part: str, config: Mapping[str, Any], uses: "HeldOutUses",
     return all(done)
 
 
-def _run_claimed(index: int, part: str, config: Mapping[str, Any], folder: Path, deadline: float) -> bool:
-    """Runs the tasks that one of several processes claims."""
+def _run_claimed(index: int, part: str, plan: Plan, config: Mapping[str, Any], folder: Path, deadline: float) -> bool:
+    """Runs the tasks that one of several processes claims. The plan is given: making it takes half a minute for a large study."""
     scene_source.use_compilation_cache()
     uses = HeldOutUses(folder / f"{index}-uses.json", command="", cut=config["cut"])
-    return _run(part, study_plan.make(config), Session(config, uses, TaskClaims(folder), deadline))
+    return _run(part, plan, Session(config, uses, TaskClaims(folder), deadline))
 
 
 class HeldOutUses:

@@ -354,9 +354,10 @@ def test_tasks_are_divided_among_processes(stub_training, tmp_path):
     config = toy(tmp_path, "parts=[train]", **ALONE)
     claims = tmp_path / "claims"
     claims.mkdir()
-    first, second = study_plan.make(config).trainings
+    plan = study_plan.make(config)
+    first, second = plan.trainings
     command.TaskClaims(claims).take(f"{first.folder.name}-trained.json")
-    assert command._run_claimed(1, "train", config, claims, math.inf)
+    assert command._run_claimed(1, "train", plan, config, claims, math.inf)
     assert stub_training == [(second.seed, False)] and not first.file.is_file()
     uses = command.HeldOutUses(tmp_path / "result.json", command="study", cut="test")
     for _ in range(2):
