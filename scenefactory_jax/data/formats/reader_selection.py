@@ -16,7 +16,6 @@ MAX_REASON = 80  # characters of a reader's refusal
 BANK_INDEX = "bank.json"  # the file that makes a folder a bank
 HEAD = 16_384  # bytes that identify formats without a reader: SUMO's networks begin with a comment of some thousand
 STARTS = {
-    b"SQLite format 3\0": "an SQLite database, such as nuPlan's logs",
     b"\x89HDF": "HDF5",
     b"PK\x03\x04": "a ZIP archive",
     b"BZh": "a file compressed by bzip2",
