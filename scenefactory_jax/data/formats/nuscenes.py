@@ -171,12 +171,11 @@ def _read_poses(folder: _Folder, samples: Mapping[str, tuple[str, int]]) -> dict
     lidars = {token for token, sensor in folder.pairs("calibrated_sensor", "sensor_token").items() if kinds.get(sensor) == "lidar"}
     owner = {}
     for row in folder.rows("sample_data"):
-        sample = row["sample_token"].expect(str)
-        if row["calibrated_sensor_token"].value in lidars and sample in samples:
+        if str(row.value.get("calibrated_sensor_token")) in lidars and (sample := row["sample_token"].expect(str)) in samples:
             owner[row["ego_pose_token"].expect(str)] = samples[sample][0]
     poses = defaultdict(lambda: array("d"))
     for row in folder.rows("ego_pose"):
-        if (scene := owner.get(row["token"].expect(str))) is not None:
+        if (scene := owner.get(str(row.value.get("token")))) is not None:
             x, y, _ = row["translation"].numbers(length=3)
             poses[scene].extend((row["timestamp"].expect(int), x, y, *row["rotation"].numbers(length=4)))
     return dict(poses)

@@ -88,7 +88,7 @@ class _Shapes:
 
     def list_line(self, record: Node) -> Plane:
         """The line of a record; without points if it has none."""
-        token = record.get("line_token", "").value
+        token = str(record.get("line_token", "").value)
         return self.list_points(self.line[token]["node_tokens"]) if token in self.line else np.zeros((0, 2))
 
     def list_polygons(self, record: Node) -> list[shapely.Polygon]:
