@@ -442,7 +442,7 @@ def test_a_refusal_says_what_a_file_is_or_what_it_is_not(tmp_path, readers):
         database.serialize(): "unknown format: nuplan: an SQLite database, but no log of nuPlan: no table lidar_pc; formats: womd, ",
         "": f"an empty file; formats: {', '.join(FORMATS)}",
         "frame,id\n1,2\n": "unknown format: it begins with b'frame,id",
-        long: "unknown format: gpudrive: expected GPUDrive JSON with 'objects', got the keys key_0,",
+        long: "unknown format: gpudrive: expected GPUDrive JSON with 'objects', got the keys [",
         pickle.dumps([1]): "unknown format: scenarionet: expected a ScenarioNet pickle with a dict, got list",
     }
     for content, reason in cases.items():

@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 import shapely
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from scipy.spatial import KDTree
 
 from scenefactory_jax.core.raw_scene import Polyline, SceneError, Track
@@ -16,6 +16,7 @@ from scenefactory_jax.core.types import EDGE_BOUNDARY, STOP_SIGN, RoadUser
 from scenefactory_jax.data.formats import drivable_outline, polylines, scene_parts
 from scenefactory_jax.data.formats.drivable_outline import OutlineNumbers
 
+ACROSS = 0.8  # cosine of the angle between an edge and a lane that it runs across
 Plane = Float[np.ndarray, "_ 2"]  # any number of points
 
 
@@ -26,7 +27,7 @@ class CityNumbers:
     reach_m: float  # of a scene's map around the recording car's path
     point_spacing_m: float  # maximum, of lanes, lines and edges
     lane_width_m: float  # that is drivable around every lane's centre
-    end_gap_m: float  # there is no edge so near to the end of a lane that leads nowhere
+    end_gap_m: float  # no edge runs across a lane so near to its end that leads nowhere
     seam_m: float  # narrower gaps between areas are closed
     hole_m2: float  # smaller holes in them are closed
 
@@ -54,6 +55,8 @@ class CityMap(NamedTuple):
     shapes: Sequence[tuple[int, Plane]]  # outlines of crosswalks, which it has whole
     signs: Sequence[Sign]
     inside: frozenset[int]  # lanes in junctions
+    points: Plane  # of all lanes, lines and shapes
+    starts: Int[np.ndarray, " _"]  # of each of them in `points`
 
 
 def make_city_map(
@@ -71,12 +74,14 @@ def make_city_map(
     outline = OutlineNumbers(cut_m=0.0, seam_m=numbers.seam_m, hole_m2=numbers.hole_m2)
     paved = [*areas, *(way for way in shapely.get_parts(ways) if not way.is_empty)]
     edges = [edge[:, :2] for edge in drivable_outline.find_edges(paved, [], outline, where, spacing_m=numbers.point_spacing_m)]
-    ends = [lane.xyz[place, :2] for lane in lanes for place, links in ((0, lane.entry), (-1, lane.exit)) if not links]
+    ends = [lane.xyz[rows, :2] for lane in lanes for rows, links in (([0, 1], lane.entry), ([-1, -2], lane.exit)) if not links]
     if ends:
-        tree = KDTree(ends)
-        edges = [piece for edge in edges for piece in _cut_line(edge, tree.query(edge)[0] > numbers.end_gap_m)]
+        edges = [piece for edge in edges for piece in _cut_line(edge, ~_find_exits(edge, np.stack(ends), numbers.end_gap_m))]
     lines = [(kind, polylines.densify(line, numbers.point_spacing_m)) for kind, line in marks if len(line) > 1]
-    return CityMap(lanes, [*lines, *((EDGE_BOUNDARY, edge) for edge in edges)], shapes, signs, frozenset(inside))
+    lines += [(EDGE_BOUNDARY, edge) for edge in edges]
+    every = [*(lane.xyz[:, :2] for lane in lanes), *(line for _, line in (*lines, *shapes))]
+    starts = np.cumsum([0, *(len(line) for line in every[:-1])])
+    return CityMap(lanes, lines, shapes, signs, frozenset(inside), np.concatenate(every), starts)
 
 
 def cut_roads(city: CityMap, path: Plane, reach_m: float) -> tuple[Polyline, ...]:
@@ -84,17 +89,32 @@ def cut_roads(city: CityMap, path: Plane, reach_m: float) -> tuple[Polyline, ...
 
     Lanes keep their ids, and their links to lanes that are left out.
     """
-    tree = KDTree(path)
-    near = lambda line: np.isfinite(tree.query(line, distance_upper_bound=reach_m)[0])  # noqa: E731
-    lanes = [lane for lane in city.lanes if near(lane.xyz[:, :2]).any()]
-    drawn = [(kind, piece) for kind, line in city.lines for piece in _cut_line(line, near(line))]
-    drawn += [(kind, shape) for kind, shape in city.shapes if near(shape).any()]
+    near = np.asarray(((city.points >= path.min(axis=0) - reach_m) & (city.points <= path.max(axis=0) + reach_m)).all(axis=1))
+    near[near] = KDTree(path).query(city.points[near])[0] <= reach_m
+    rows = np.flatnonzero(np.add.reduceat(near, city.starts, dtype=int)).tolist()
+    lanes = [city.lanes[row] for row in rows if row < len(city.lanes)]
+    drawn: list[tuple[int, Plane]] = []
+    for row in rows[len(lanes) :]:
+        place, start = row - len(city.lanes), city.starts[row]
+        if place < len(city.lines):
+            kind, line = city.lines[place]
+            drawn += [(kind, piece) for piece in _cut_line(line, near[start : start + len(line)])]
+        else:
+            drawn.append(city.shapes[place - len(city.lines)])
     start = max((lane.id for lane in city.lanes), default=0) + 1
     others = [Polyline(kind, to_level(line), start + place) for place, (kind, line) in enumerate(drawn)]
     there, start = {lane.id for lane in lanes}, start + len(drawn)
     signs = [sign for sign in city.signs if there.intersection(sign.lanes)]
     stops = [Polyline(STOP_SIGN, to_level(sign.place), start + place, lanes=sign.lanes) for place, sign in enumerate(signs)]
     return (*lanes, *others, *stops)
+
+
+def _find_exits(edge: Plane, ends: Float[np.ndarray, "N 2 2"], gap_m: float) -> Bool[np.ndarray, " _"]:
+    """Where an edge runs across a lane's end nearby; `ends` are the last points of lanes and those before them."""
+    apart, nearest = KDTree(ends[:, 0]).query(edge)
+    along, tangent = (ends[:, 1] - ends[:, 0])[nearest], np.gradient(edge, axis=0)
+    lengths = np.linalg.norm(along, axis=1) * np.linalg.norm(tangent, axis=1)
+    return np.asarray((apart <= gap_m) & (np.abs(np.sum(along * tangent, axis=1)) < ACROSS * lengths))
 
 
 def _cut_line(line: Plane, near: Bool[np.ndarray, " _"]) -> list[Plane]:
@@ -154,8 +174,8 @@ def find_file(path: Path, folder: str | None, key: str, patterns: Sequence[str])
     Of several the one in the folder of the highest version is taken. `key` is that of `folder` in the config, for messages.
     """
     above = Path(path).absolute().parents
-    roots = [Path(folder)] if folder is not None else [place for parent in above for place in (parent / "maps", parent)]
-    for root in roots:
+    tops = [Path(folder)] if folder is not None else above
+    for root in (place for top in tops for place in (top / "maps", top)):
         for pattern in patterns:
             if found := [file for file in root.glob(pattern) if file.is_file()]:
                 return max(found, key=lambda file: [int(part) for part in re.findall(r"\d+", file.parent.name)])

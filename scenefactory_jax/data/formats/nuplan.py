@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float, Int
 
-from scenefactory_jax.core.raw_scene import LIGHT_STATES, Companion, Light, OtherContent, RawScene, SceneError, Track
+from scenefactory_jax.core.raw_scene import LIGHT_STATES, Companion, Light, OtherContent, RawScene, Reject, SceneError, Track
 from scenefactory_jax.core.types import RoadUser
 from scenefactory_jax.data.formats import city_map, geopackage, nuplan_map, scene_parts
 from scenefactory_jax.data.formats.city_map import CityMap, CityNumbers, EgoBox
@@ -77,7 +77,7 @@ def read(
     roads: CityNumbers,
     ego: EgoBox,
     row_limit: int,
-) -> Iterator[RawScene]:
+) -> Iterator[RawScene | Reject]:
     """Reads the scenes of a log: one after another, named by the token of their current frame, as nuPlan names its scenarios.
 
     Args:
@@ -89,6 +89,8 @@ def read(
         ego: the recording car.
         row_limit: larger tables are refused, as are scenes with more boxes.
     """
+    if Path(path).match("nuplan-maps-*.json"):
+        raise Companion(f"{path}: the list of nuPlan's maps")
     with geopackage.open_database(path, row_limit) as database:
         if "lidar_pc" not in database.columns:
             if geopackage.CONTENTS in database.columns and nuplan_map.PATHS in database.columns:
@@ -104,7 +106,10 @@ def read(
         city = nuplan_map.read_map(source, box, numbers=roads, row_limit=row_limit)
         log = _Log(database, frames, _read_objects(database), types, about, city, current, roads.reach_m, ego)
         for window in windows:
-            yield _make_scene(log, window)
+            try:
+                yield _make_scene(log, window)
+            except SceneError as error:
+                yield Reject(window.name, str(error).removeprefix(f"{path}: "))
 
 
 def _make_scene(log: _Log, window: _Window) -> RawScene:
@@ -117,6 +122,8 @@ def _make_scene(log: _Log, window: _Window) -> RawScene:
     tracks = [_make_track(log, token, rows, times, ids[_name(token)]) for token, rows in boxes.items()]
     roads = city_map.cut_roads(log.city, ego.xyz[:, :2], log.reach_m)
     lanes = {lane.id for lane in log.city.lanes} & {line.id for line in roads}
+    if not lanes:
+        raise SceneError(f"{path}: {window.name}: expected lanes within {log.reach_m:g} m of the recording car, got none")
     return RawScene(
         name=f"{log.about['log']}-{window.name}",
         source=path,

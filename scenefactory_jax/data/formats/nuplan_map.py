@@ -61,7 +61,7 @@ def read_map(path: Path, box: Box, *, numbers: CityNumbers, row_limit: int) -> C
     return city_map.make_city_map(
         lanes,
         [(MARKS[kind], geopackage.list_lines(s)) for s, (kind,) in zip(marks.shapes, marks.rows, strict=True) if kind in MARKS],
-        [(kind, shapely.get_coordinates(shape.exterior)) for kind, shape in shapes],
+        [(kind, shapely.get_coordinates(shape.exterior)[:-1]) for kind, shape in shapes],
         [sign for shape, row in zip(stops.shapes, stops.rows, strict=True) for sign in _list_signs(shape, row, ids)],
         [ids[CONNECTORS, fid] for fid, place in crossing.items() if (CONNECTORS, fid) in ids and place not in (None, *passes)],
         areas,

@@ -35,6 +35,8 @@ TABLES = (
     "attribute",
     "log",
 )
+SENSORS = ("CAM_", "LIDAR_", "RADAR_", "MergedPointCloud")  # beginnings of folders with recordings of sensors, as of nuPlan's
+RECORDINGS = (".jpg", ".bin", ".pcd")
 OTHERS = ("map", "visibility", "lidarseg", "panoptic", "image_annotations")  # of the same folder, which no scene needs
 EGO = "ego"
 KINDS: dict[str, RoadUser] = {  # beginnings of a category's name; the first that fits
@@ -103,6 +105,8 @@ def read(
 
 def _check_kind(path: Path) -> None:
     """Raises for any file but `scene.json`: whether it belongs to it."""
+    if Path(path).suffix in RECORDINGS and Path(path).parent.name.startswith(SENSORS):
+        raise Companion(f"{path}: a recording of a sensor")
     start, name = file_content.read_head(path).removeprefix(b"\xef\xbb\xbf").lstrip(), Path(path).name
     if start.startswith(b"{") and any(key in start for key in nuscenes_map.KEYS):
         raise Companion(f"{path}: a map of nuScenes")

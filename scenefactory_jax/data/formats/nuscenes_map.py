@@ -55,7 +55,7 @@ def read_map(path: Path, *, numbers: CityNumbers, file_limit_mb: int) -> CityMap
     return city_map.make_city_map(
         [_make_lane(records[token], token, line, ids, document) for token, line in centres.items()],
         _list_marks(document, shapes),
-        [(CROSSWALK, shapely.get_coordinates(polygon.exterior)) for polygon in crossings],
+        [(CROSSWALK, shapely.get_coordinates(polygon.exterior)[:-1]) for polygon in crossings],
         _list_signs([polygon for stop in stops for polygon in shapes.list_polygons(stop)], centres, lanes, ids),
         _find_inside(centres, connectors, [p for row in junctions for p in shapes.list_polygons(row)], ids),
         areas,
