@@ -14,7 +14,8 @@ from support.scene_documents import FORMATS, prepared
 
 from scenefactory_jax.core.raw_scene import LIGHT_STATES, Companion, FormatMismatch, Reject, SceneError
 from scenefactory_jax.core.types import CROSSWALK, EDGES, LANE_BIKE, LANE_STREET, LINES, STOP_SIGN
-from scenefactory_jax.data.formats import reader_selection
+from scenefactory_jax.data.formats import nuscenes_map, reader_selection
+from scenefactory_jax.data.formats.city_map import CityNumbers
 
 STEPS = 12
 
@@ -237,6 +238,21 @@ def test_nuscenes(tables):
     way = shapely.LineString(next(line.xyz[:, :2] for line in raw.roads if line.id == places[22]))
     apart = [shapely.LineString(line.xyz[:, :2]).distance(way) for line in raw.roads if line.kind in EDGES]
     assert min(apart) == pytest.approx(1.25, abs=0.05)
+
+
+@pytest.mark.parametrize("shape, start, end, radius, lengths", [  # of lanes of the published maps
+    ("LSR", [421.2419602954602, 1087.9127960414617, 2.739593514975998], [391.7142849867393, 1100.464077182952], 999.999,
+     [0.23651121617864976, 28.593481378991886, 3.254561444252876]),
+    ("RSL", [222.2254118951833, 915.391419147894, 3.0714875295916646], [191.21890533615024, 917.7923193982866], 999.999,
+     [9.660415496296451, 13.603044909701394, 7.835994888818709]),
+])  # fmt: skip
+def test_a_path_of_nuscenes_ends_where_the_map_says(tables, shape, start, end, radius, lengths):
+    path = tables.parents[1] / "maps" / "expansion" / "boston-seaport.json"
+    whole = json.loads(path.read_text())
+    record = {"start_pose": start, "end_pose": [*end, 0.0], "shape": shape, "radius": radius, "segment_length": lengths}
+    path.write_text(json.dumps(whole | {"arcline_path_3": {"lane11": [record]}}))
+    city = nuscenes_map.read_map(path, numbers=CityNumbers(**FORMATS["nuscenes"]["roads"]), file_limit_mb=1)
+    np.testing.assert_allclose(city.lanes[0].xyz[[0, -1], :2], [start[:2], end], atol=1e-6)
 
 
 def test_the_tracks_of_nuscenes(tables):

@@ -310,5 +310,5 @@ def nuscenes_map():
     kinds = ("DOUBLE_DASHED_WHITE", "DOUBLE_DASHED_WHITE", "NIL", "NIL")
     whole["line"].append({"token": "ldashes", "node_tokens": points})
     segments = [{"node_token": name, "segment_type": kind} for name, kind in zip(points, kinds, strict=True)]
-    add("lane_divider", "dashes", lane_divider_segments=segments, line_token="ldashes")
+    add("lane_divider", "dashes", lane_divider_segments=[*segments[2:], *segments[:3]], line_token="ldashes")  # as they come: in no order
     return whole | {"arcline_path_3": paths, "connectivity": links}

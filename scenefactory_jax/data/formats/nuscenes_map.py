@@ -42,8 +42,7 @@ def read_map(path: Path, *, numbers: CityNumbers, file_limit_mb: int) -> CityMap
     shapes = _Shapes(document)
     paths = document["arcline_path_3"].entries(dict)
     lanes, connectors = _list_rows(document, "lane"), _list_rows(document, "lane_connector")
-    records = {token: record for token, record in (lanes | connectors).items() if token in paths}
-    centres = {token: _follow(paths[token], numbers.point_spacing_m) for token in records}
+    centres = {token: _follow(path, numbers.point_spacing_m) for token, path in paths.items()}
     centres = {token: line for token, line in centres.items() if len(line) > 1}
     if not centres:
         raise SceneError(f"{path}: arcline_path_3: expected the paths of lanes, got none")
@@ -53,7 +52,7 @@ def read_map(path: Path, *, numbers: CityNumbers, file_limit_mb: int) -> CityMap
     stops = [row for row in _list_rows(document, "stop_line").values() if row.get("stop_line_type", "").value == STOP_SIGN_LINE]
     junctions = [row for row in _list_rows(document, "road_segment").values() if row.get("is_intersection", False).value]
     return city_map.make_city_map(
-        [_make_lane(records[token], token, line, ids, document) for token, line in centres.items()],
+        [_make_lane(lanes.get(token), token, line, ids, document) for token, line in centres.items()],
         _list_marks(document, shapes),
         [(CROSSWALK, shapely.get_coordinates(polygon.exterior)[:-1]) for polygon in crossings],
         _list_signs([polygon for stop in stops for polygon in shapes.list_polygons(stop)], centres, lanes, ids),
@@ -86,10 +85,14 @@ class _Shapes:
             raise SceneError(f"{tokens.where}: expected the token of a node, got {missing[0]!r:.60}")
         return self.xy[[self.node[name] for name in names]]
 
-    def list_line(self, record: Node) -> Plane:
-        """The line of a record; without points if it has none."""
+    def list_line_nodes(self, record: Node) -> list[str]:
+        """The nodes of a record's line; none if it has no line."""
         token = str(record.get("line_token", "").value)
-        return self.list_points(self.line[token]["node_tokens"]) if token in self.line else np.zeros((0, 2))
+        return list(map(str, self.line[token]["node_tokens"].expect(list))) if token in self.line else []
+
+    def list_line(self, record: Node) -> Plane:
+        """The points of a record's line."""
+        return self.list_points(Node(self.list_line_nodes(record), f"{record.where}: line"))
 
     def list_polygons(self, record: Node) -> list[shapely.Polygon]:
         """The polygons of a record, with their holes; those with less than three points are left out."""
@@ -125,11 +128,12 @@ def _follow(paths: Node, spacing_m: float) -> Plane:
     return line[np.linalg.norm(np.diff(line, axis=0, prepend=np.inf), axis=1) > JOINT_M] if len(line) else line
 
 
-def _make_lane(record: Node, token: str, line: Plane, ids: Mapping[str, int], document: Node) -> Polyline:
+def _make_lane(record: Node | None, token: str, line: Plane, ids: Mapping[str, int], document: Node) -> Polyline:
     """A lane with its links to lanes there."""
     links = document.get("connectivity", {}).get(token, {})
     entry, following = (tuple(ids[t] for t in map(str, links.get(key, []).expect(list)) if t in ids) for key in ("incoming", "outgoing"))
-    kind = LANE_BIKE if str(record.get("lane_type", "CAR").value).upper().startswith("BI") else LANE_STREET
+    name = "CAR" if record is None else str(record.get("lane_type", "CAR").value).upper()
+    kind = LANE_BIKE if name.startswith("BI") else LANE_STREET
     return Polyline(kind, city_map.to_level(line), ids[token], entry=entry, exit=following)
 
 
@@ -137,15 +141,13 @@ def _list_marks(document: Node, shapes: _Shapes) -> list[tuple[int, Plane]]:
     """Dividers of lanes, in pieces of one type, and of roads."""
     marks = [(ROAD_DIVIDER, shapes.list_line(record)) for record in _list_rows(document, "road_divider").values()]
     for record in _list_rows(document, "lane_divider").values():
-        segments = list(record.get("lane_divider_segments", []).entries(list).values())
-        if len(segments) < 2:
-            marks.append((BROKEN, shapes.list_line(record)))
-            continue
-        points = shapes.list_points(Node([segment["node_token"].value for segment in segments], record.where))
-        kinds = [MARKS.get(str(segment.get("segment_type", "NIL").value), UNKNOWN) for segment in segments[:-1]]
+        segments = record.get("lane_divider_segments", []).entries(list).values()  # in no order
+        types = {str(segment["node_token"].value): str(segment.get("segment_type", "NIL").value) for segment in segments}
+        names, points = shapes.list_line_nodes(record), shapes.list_line(record)
+        kinds = [MARKS.get(types[name], UNKNOWN) if name in types else BROKEN for name in names[:-1]]
         starts = [0, *(place for place in range(1, len(kinds)) if kinds[place] != kinds[place - 1]), len(kinds)]
-        marks += [(kinds[a], points[a : b + 1]) for a, b in itertools.pairwise(starts) if kinds[a] is not None]
-    return [(kind, line) for kind, line in marks if kind is not None]
+        marks += [(kind, points[a : b + 1]) for a, b in itertools.pairwise(starts) if a < b and (kind := kinds[a]) is not None]
+    return marks
 
 
 def _list_signs(
