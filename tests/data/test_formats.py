@@ -5,6 +5,7 @@ import json
 import lzma
 import os
 import pickle
+import sqlite3
 import struct
 from collections import Counter
 
@@ -430,16 +431,18 @@ def test_a_refusal_names_the_format_of_real_files(shared_data):
 
 def test_a_refusal_says_what_a_file_is_or_what_it_is_not(tmp_path, readers):
     long = json.dumps({f"key_{number}": 1 for number in range(500)})
+    database = sqlite3.connect(":memory:")
+    database.execute("CREATE TABLE other (x)")
     comment = f"<?xml version='1.0'?>\n<!-- <net> {'x' * 5000} -->\n"
     cases = {
         f"{comment}<routes/>": "this is routes of SUMO: it is not read",
         f"{comment}<kml xmlns='x'>": "this is XML of the root element 'kml': it is not read",
         "<?xml version='1.0' encoding='utf-16'?><net>".encode("utf-16"): "this is a network of SUMO",
         "<" + "?" * 9000: "unknown format: it begins with b'<???",
-        b"SQLite format 3\0" + bytes(100): "this is an SQLite database",
+        database.serialize(): "unknown format: nuplan: an SQLite database, but no log of nuPlan: no table lidar_pc; formats: womd, ",
         "": f"an empty file; formats: {', '.join(FORMATS)}",
         "frame,id\n1,2\n": "unknown format: it begins with b'frame,id",
-        long: "unknown format: gpudrive: expected GPUDrive JSON with 'objects', got the keys key_0,",
+        long: "unknown format: gpudrive: expected GPUDrive JSON with 'objects', got the keys [",
         pickle.dumps([1]): "unknown format: scenarionet: expected a ScenarioNet pickle with a dict, got list",
     }
     for content, reason in cases.items():

@@ -12,7 +12,7 @@ from support.scene_documents import FORMATS, prepared
 
 from scenefactory_jax.core.raw_scene import Companion, RawScene, SceneError
 from scenefactory_jax.core.types import DRIVABLE, EDGES, STOP_SIGN
-from scenefactory_jax.data.formats import lanelet2, reader_selection
+from scenefactory_jax.data.formats import projection, reader_selection
 
 STEPS = 12
 
@@ -41,19 +41,26 @@ def recording(tmp_path):
 
 
 def test_positions_are_projected_as_in_utm():
-    eccentric = lanelet2.WGS84_F * (2 - lanelet2.WGS84_F)
-    across = lambda phi: lanelet2.WGS84_A / np.sqrt(1 - eccentric * np.sin(phi) ** 2)  # noqa: E731
+    eccentric = projection.WGS84_F * (2 - projection.WGS84_F)
+    across = lambda phi: projection.WGS84_A / np.sqrt(1 - eccentric * np.sin(phi) ** 2)  # noqa: E731
     along = lambda phi: across(phi) * (1 - eccentric) / (1 - eccentric * np.sin(phi) ** 2)  # noqa: E731
     for latitude in (-33.0, 12.0, 49.0):  # true to scale along the meridian: there, the arc length
-        east, north = lanelet2.project(latitude, 9.0, 9.0)
+        east, north = projection.project(latitude, 9.0, 9.0)
         assert abs(east) < 1e-9 and north == pytest.approx(0.9996 * quad(along, 0, np.deg2rad(latitude), epsabs=1e-9)[0], abs=1e-3)
     for latitude, longitude in ((0.01, 0.01), (49.0, 8.4), (-33.0, 6.2)):  # and conformal: one scale in all directions, right angles
         step = 1e-5
-        (e, n), turns = lanelet2.project(latitude, longitude, 9.0), np.deg2rad(step)
-        north = np.subtract(lanelet2.project(latitude + step, longitude, 9.0), (e, n)) / (turns * along(np.deg2rad(latitude)))
+        (e, n), turns = projection.project(latitude, longitude, 9.0), np.deg2rad(step)
+        north = np.subtract(projection.project(latitude + step, longitude, 9.0), (e, n)) / (turns * along(np.deg2rad(latitude)))
         phi = np.deg2rad(latitude)
-        east = np.subtract(lanelet2.project(latitude, longitude + step, 9.0), (e, n)) / (turns * across(phi) * np.cos(phi))
+        east = np.subtract(projection.project(latitude, longitude + step, 9.0), (e, n)) / (turns * across(phi) * np.cos(phi))
         np.testing.assert_allclose(north, [-east[1], east[0]], atol=1e-6)
+
+
+def test_a_place_in_utm():
+    tower = projection.project_utm(np.array([[-(79 + 23 / 60 + 13.7 / 3600), 43 + 38 / 60 + 33.24 / 3600]]), zone=17, south=False)
+    np.testing.assert_allclose(tower, [[630084, 4833438]], atol=1.5)  # the CN Tower in Toronto, as published to the metre
+    below, above = (projection.project_utm(np.array([[-79.4, y]]), zone=17, south=y < 0)[0] for y in (-43.6, 43.6))
+    np.testing.assert_allclose(below + above, [2 * above[0], 10_000_000])
 
 
 def test_a_map_made_by_hand(tmp_path, readers):

@@ -13,6 +13,7 @@ from scenefactory_jax.core.raw_scene import SceneError
 from scenefactory_jax.data.formats import polylines
 
 Points = Float[np.ndarray, "_ 3"]  # any number of them
+Area = Points | shapely.Polygon
 SIMPLIFY_M = 0.01  # maximum distance of a closed outline from what it was
 
 
@@ -26,22 +27,23 @@ class OutlineNumbers:
 
 
 def find_edges(
-    areas: Sequence[Points], centres: Sequence[Points], numbers: OutlineNumbers, where: str, *, spacing_m: float = np.inf
+    areas: Sequence[Area], centres: Sequence[Points], numbers: OutlineNumbers, where: str, *, spacing_m: float = np.inf
 ) -> list[Points]:
     """The outline of all drivable areas together, without the pieces at which a lane leaves the map; heights are those of the corners.
 
     What is drivable lies on the left of every edge, as in WOMD.
 
     Args:
-        areas, centres: outlines of the areas, and lines of lanes.
+        areas, centres: outlines of the areas, or polygons, which may have holes and are level; and lines of lanes.
         where: file and key, for messages.
         spacing_m: maximum between points.
     """
-    areas = [xyz for xyz in areas if len(xyz) > 2]
+    areas = [area for area in areas if isinstance(area, shapely.Polygon) or len(area) > 2]
     if not areas:
         return []
     try:
-        area = shapely.union_all([shapely.make_valid(shapely.Polygon(xyz[:, :2])) for xyz in areas])
+        polygons = [area if isinstance(area, shapely.Polygon) else shapely.Polygon(area[:, :2]) for area in areas]
+        area = shapely.union_all([shapely.make_valid(polygon) for polygon in polygons])
         if (seam_m := numbers.seam_m) > 0:
             area = area.buffer(seam_m, join_style="mitre").buffer(-seam_m, join_style="mitre").simplify(SIMPLIFY_M)
         parts = [part for part in shapely.get_parts(area) if part.geom_type == "Polygon"]
@@ -54,7 +56,7 @@ def find_edges(
     except (shapely.errors.ShapelyError, ValueError) as error:
         raise SceneError(f"{where}: no outline can be drawn around them: {error}") from error
     pieces = [polylines.densify(piece, spacing_m) for ring, cut in zip(rings, gaps, strict=True) for piece in _pieces(ring, cut)]
-    corners = np.concatenate(areas)
+    corners = np.concatenate([np.pad(shapely.get_coordinates(a), ((0, 0), (0, 1))) if isinstance(a, shapely.Polygon) else a for a in areas])
     tree = KDTree(corners[:, :2])
     return [np.column_stack([piece, corners[tree.query(piece)[1], 2]]) for piece in pieces]
 

@@ -18,7 +18,7 @@ from scipy.spatial import KDTree
 
 from scenefactory_jax.core.raw_scene import Companion, Polyline, RawScene, Reject, SceneError
 from scenefactory_jax.core.types import CROSSWALK, EDGE_BOUNDARY, LANE_BIKE, LANE_FREEWAY, LANE_STREET, STOP_SIGN
-from scenefactory_jax.data.formats import lanelet_map, polylines, xml_content
+from scenefactory_jax.data.formats import lanelet_map, polylines, projection, xml_content
 from scenefactory_jax.data.formats.drivable_outline import OutlineNumbers, Points
 from scenefactory_jax.data.formats.lanelet_map import Lanelet
 from scenefactory_jax.data.formats.opendrive_signals import Signal, group_lights
@@ -38,7 +38,6 @@ LIMIT = re.compile(r"([\d.]+)\s*(mph|km/h|kmh|m/s|mps)?")
 UNITS = {"mph": 1609.344 / 3600, "m/s": 1.0, "mps": 1.0}
 AROUND_ZERO_DEG = 0.5  # a map nearer to (0, 0) is in local metres
 OVERLAP_M2 = 1.0  # lanelets that share more area meet in a junction
-WGS84_A, WGS84_F, UTM_SCALE = 6378137.0, 1 / 298.257223563, 0.9996
 
 
 class Map(NamedTuple):
@@ -130,8 +129,8 @@ def _read_points(document: Element) -> tuple[dict[str, Float[np.ndarray, "3"]], 
         raise SceneError(f"{node.where}: expected degrees of latitude and longitude, got {node.get('lat')}, {node.get('lon')}")
     middle = degrees[0] * (np.abs(degrees[0]).max() > AROUND_ZERO_DEG)
     meridian = 6.0 * np.floor(middle[1] / 6.0) + 3.0
-    origin = project(middle[0], middle[1], meridian)
-    plane = np.stack(project(degrees[:, 0], degrees[:, 1], meridian), axis=1) - origin
+    origin = projection.project(middle[0], middle[1], meridian)
+    plane = np.stack(projection.project(degrees[:, 0], degrees[:, 1], meridian), axis=1) - origin
     points = {}
     for node, place in zip(nodes, plane, strict=True):
         tags = {tag.get("k"): tag for tag in node.all("tag")}
@@ -139,20 +138,6 @@ def _read_points(document: Element) -> tuple[dict[str, Float[np.ndarray, "3"]], 
             place = [tags[key].number("v") for key in ("local_x", "local_y")]
         points[node.get("id")] = np.array([*place, tags["ele"].number("v") if "ele" in tags else 0.0])
     return points, (float(origin[0]), float(origin[1]), 0.0)
-
-
-def project(latitude: Any, longitude: Any, meridian: float) -> tuple[Any, Any]:
-    """Easting (from the central meridian) and northing of positions in degrees."""
-    n = WGS84_F / (2 - WGS84_F)
-    radius = WGS84_A / (1 + n) * (1 + n**2 / 4 + n**4 / 64) * UTM_SCALE
-    series = (n / 2 - 2 * n**2 / 3 + 5 * n**3 / 16, 13 * n**2 / 48 - 3 * n**3 / 5, 61 * n**3 / 240)
-    sine, turn, k = np.sin(np.deg2rad(latitude)), np.deg2rad(longitude - meridian), 2 * np.sqrt(n) / (1 + n)
-    t = np.sinh(np.arctanh(sine) - k * np.arctanh(k * sine))
-    north, east = np.arctan2(t, np.cos(turn)), np.arctanh(np.sin(turn) / np.sqrt(1 + t**2))
-    steps = range(1, len(series) + 1)
-    more_east = sum(a * np.cos(2 * j * north) * np.sinh(2 * j * east) for j, a in zip(steps, series, strict=True))
-    more_north = sum(a * np.sin(2 * j * north) * np.cosh(2 * j * east) for j, a in zip(steps, series, strict=True))
-    return radius * (east + more_east), radius * (north + more_north)
 
 
 def _read_way(record: Element, points: Mapping[str, np.ndarray]) -> _Way:

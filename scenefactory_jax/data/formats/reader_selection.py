@@ -12,11 +12,10 @@ from scenefactory_jax.core.instantiate import instantiate
 from scenefactory_jax.core.raw_scene import FormatMismatch, OtherContent, RawScene, Reject, SceneError
 from scenefactory_jax.data.formats import file_content
 
-MAX_REASON = 80  # characters of a reader's refusal
+MAX_REASON = 72  # characters of a reader's refusal
 BANK_INDEX = "bank.json"  # the file that makes a folder a bank
 HEAD = 16_384  # bytes that identify formats without a reader: SUMO's networks begin with a comment of some thousand
 STARTS = {
-    b"SQLite format 3\0": "an SQLite database, such as nuPlan's logs",
     b"\x89HDF": "HDF5",
     b"PK\x03\x04": "a ZIP archive",
     b"BZh": "a file compressed by bzip2",
