@@ -65,6 +65,17 @@ def test_a_small_scene_by_hand(small):
     assert empty["objects"] == empty["lane_m"] == empty["intersections"] == 0 and empty["streets"] == []
 
 
+def test_a_recorded_drive_off_the_road_or_into_another_car_is_seen(small):
+    """The edge at y = 9 has the road to its left: corners at y = -1 are 10 m off it; reversed, those at y = 1 are 8 m inside."""
+    back = replace(small, roads=(replace(small.roads[4], xyz=small.roads[4].xyz[::-1]),))
+    found = [FEATURES(scene) for scene in (small, back)]
+    assert [row["sdc_off_road_m"] for row in found] == pytest.approx([10.0, -8.0], abs=0.05)
+    assert [row["sdc_overlap_steps"] for row in found] == [0, 0]
+    parked = driver(7, (5, 0.5), 0)  # the SDC's centre passes from 0 to 10 m, boxes of 4 m meet between 1 and 9 m
+    assert FEATURES(replace(small, tracks=(*small.tracks, parked)))["sdc_overlap_steps"] == 7
+    assert FEATURES(replace(small, tracks=(*small.tracks, replace(parked, xyz=parked.xyz + np.array([0, 0, 8])))))["sdc_overlap_steps"] == 0  # on a bridge
+
+
 def test_every_column_is_described_and_none_is_another_s():
     assert list(features.COLUMNS) == list(FEATURES(generated(0)))
     assert not set(features.COLUMNS) & set(catalogue.COLUMNS)

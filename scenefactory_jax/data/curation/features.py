@@ -18,6 +18,7 @@ from scenefactory_jax.core.raw_scene import Polyline, RawScene, Track
 from scenefactory_jax.core.scene_arrays import wrap_angles
 from scenefactory_jax.core.types import DRIVABLE, DRIVEWAY, EDGES, LANE_BIKE, LINES, SPEED_BUMP
 from scenefactory_jax.data.curation import geographic_split
+from scenefactory_jax.data.curation.recorded_drive import measure_recorded_drive
 from scenefactory_jax.data.packing.pack import box_corners, overlaps
 
 LEVEL_M = 3.0  # lanes farther apart in height do not cross
@@ -36,10 +37,12 @@ COLUMNS: dict[str, str] = {
     "distance_m": "Distance travelled by all moving objects.",
     "mean_speed_m_s": "Mean speed of the moving vehicles over their valid steps; null without any.",
     "top_speed_m_s": "Largest speed of a vehicle.",
-    "sdc_distance_m": "Distance travelled by the SDC; this and the next three are null without an SDC.",
+    "sdc_distance_m": "Distance travelled by the SDC; this and the next five are null without an SDC.",
     "sdc_mean_speed_m_s": "The SDC's mean speed.",
     "sdc_top_speed_m_s": "The SDC's largest speed.",
     "sdc_turn_deg": "Turn of the SDC's heading from first to last step, left is positive.",
+    "sdc_off_road_m": "Farthest that a corner of the SDC is off the road, by V-Max's rule (negative: never); null without edges.",
+    "sdc_overlap_steps": "Steps at which the SDC's box shares ground with another one.",
     "map_features": "Polylines, polygons and points of the map.",
     "lane_m": "Length of all driving lanes.",
     "bike_lane_m": "Length of all bike lanes.",
@@ -83,7 +86,7 @@ def features(
     found |= _traffic(seen, moving_m)
     present = [track for track in seen if track.valid[raw.current]]
     found |= {"present_objects": len(present), "overlaps": _overlaps(present, raw.current)}
-    found |= _recorder(None if raw.sdc is None else raw.tracks[raw.sdc])
+    found |= _recorder(None if raw.sdc is None else raw.tracks[raw.sdc]) | measure_recorded_drive(raw, LEVEL_M)
     found |= _map(raw.roads)
     lanes = [line for line in raw.roads if line.kind in DRIVABLE]
     found |= _bends(lanes, chord_m, curve_radius_m)
