@@ -73,7 +73,8 @@ def test_a_recorded_drive_off_the_road_or_into_another_car_is_seen(small):
     assert [row["sdc_overlap_steps"] for row in found] == [0, 0]
     parked = driver(7, (5, 0.5), 0)  # the SDC's centre passes from 0 to 10 m, boxes of 4 m meet between 1 and 9 m
     assert FEATURES(replace(small, tracks=(*small.tracks, parked)))["sdc_overlap_steps"] == 7
-    assert FEATURES(replace(small, tracks=(*small.tracks, replace(parked, xyz=parked.xyz + np.array([0, 0, 8])))))["sdc_overlap_steps"] == 0  # on a bridge
+    bridge = replace(parked, xyz=parked.xyz + np.array([0, 0, 8]))
+    assert FEATURES(replace(small, tracks=(*small.tracks, bridge)))["sdc_overlap_steps"] == 0
 
 
 def test_every_column_is_described_and_none_is_another_s():
