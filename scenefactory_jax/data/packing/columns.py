@@ -10,13 +10,13 @@ from typing import Any, NamedTuple, TypeVar
 import numpy as np
 
 from scenefactory_jax.core.pytree import unchecked
-from scenefactory_jax.core.types import DRIVABLE, EDGES, Boxes, Patches, Rain, Road, Scene, SpatialGrid
+from scenefactory_jax.core.types import DRIVABLE, EDGES, Boxes, Elevation, Patches, Rain, Road, Scene, SpatialGrid
 
 T = TypeVar("T")
 
 ROADS = ("road", "lanes", "edges")
 SAMPLED = (Patches, Rain, Boxes)  # parts of a scene that resets sample: no file has them, and packed scenes have none of their rows
-DERIVED = SpatialGrid | None  # computed from the other columns
+OPTIONAL = (SpatialGrid | None, Elevation | None)  # no columns: `spatial_grid.attach_grid` and `elevation_grid` make and stack them
 DTYPES = {"float": np.dtype(np.float32), "int": np.dtype(np.int32), "bool": np.dtype(bool)}
 AXES = {  # letter of an annotation -> name; P is the part itself
     "A": "agents", "O": "traffic", "L": "steps", "R": "routes", "N": "route_points", "S": "stops", "Z": "zones", "C": "controls",
@@ -45,7 +45,7 @@ def _describe(kind: Any, prefix: str = "") -> dict[str, Column]:
         name = prefix + entry.name
         if dataclasses.is_dataclass(entry.type) and entry.type not in SAMPLED:
             columns |= _describe(entry.type, f"{name}.")
-        elif entry.type not in (*SAMPLED, DERIVED):
+        elif entry.type not in (*SAMPLED, *OPTIONAL):
             columns[name] = _read_annotation(entry.type, prefix.rstrip("."))
     return columns
 
@@ -58,7 +58,7 @@ def assemble_columns(kind: type[T], columns: Mapping[str, np.ndarray], prefix: s
     leaves: dict[str, Any] = {}
     for entry in dataclasses.fields(kind):  # pyright: ignore[reportArgumentType]
         struct: Any = entry.type
-        if struct == DERIVED:
+        if struct in OPTIONAL:
             leaves[entry.name] = None
         elif struct in SAMPLED:
             worlds = columns["log.dt"].shape  # () or the number of stacked scenes
@@ -78,7 +78,7 @@ def flatten(value: Any, prefix: str = "") -> dict[str, np.ndarray]:
     leaves: dict[str, np.ndarray] = {}
     for entry in dataclasses.fields(value):
         leaf, name = getattr(value, entry.name), prefix + entry.name
-        if not isinstance(leaf, (*SAMPLED, DERIVED)):
+        if not isinstance(leaf, (*SAMPLED, *OPTIONAL)):
             leaves |= flatten(leaf, f"{name}.") if dataclasses.is_dataclass(leaf) else {name: np.asarray(leaf)}
     return leaves
 

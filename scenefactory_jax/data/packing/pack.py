@@ -15,9 +15,10 @@ from scenefactory_jax.core.scene_arrays import Logs, join_lines, segment_lengths
 from scenefactory_jax.core.schema import Bounds, ConfigError, Positive
 from scenefactory_jax.core.types import DRIVABLE, POLYGONS, ROAD_USERS, Scene
 from scenefactory_jax.data.formats.polylines import densify
-from scenefactory_jax.data.packing import columns, control_columns, drawn_starts, route_columns, route_conflicts
+from scenefactory_jax.data.packing import columns, control_columns, drawn_starts, elevation_grid, route_columns, route_conflicts
 from scenefactory_jax.data.packing.control_columns import ControlsConfig
 from scenefactory_jax.data.packing.drawn_starts import Conflicts, find_conflicts
+from scenefactory_jax.data.packing.elevation_grid import ElevationConfig
 from scenefactory_jax.data.packing.route_columns import RouteConfig, RouteCounts
 
 DEGENERATE_M = 1e-6  # shorter segments have no direction
@@ -25,7 +26,7 @@ DROPS: tuple[str, ...] = (
     "not_a_vehicle", "absent_at_start", "start_outside_box", "goal_outside_box", "too_short", "no_conflict", "overlaps", "over_capacity",
 )  # fmt: skip
 TRAFFIC_DROPS: tuple[str, ...] = ("absent_from_start_on", "outside_box", "overlaps_agent", "over_capacity")
-REFUSALS: tuple[str, ...] = ("no_lane_in_box", "no_agent_left")  # why a scene is not packed
+REFUSALS: tuple[str, ...] = ("no_lane_in_box", "no_agent_left", "levels")  # why a scene is not packed
 CUTS: tuple[str, ...] = ("outside_box", "gap", "degenerate")
 
 
@@ -51,7 +52,7 @@ class PackReport:
     signs_inferred: int  # stop signs whose lanes were inferred
     segments_kept: int
     segments_cut: dict[str, int]  # reason of CUTS -> count
-    relief_m: float  # height between the lowest and the highest kept road point: the packed scene is flat
+    relief_m: float  # height between the lowest and the highest kept road point
     repairs: tuple[str, ...] = ()
     metadata: dict[str, Any] = field(default_factory=dict)
     raw: RawScene | None = None  # the checked scene itself, where it is kept
@@ -102,6 +103,7 @@ def pack(
     starts: dict[str, Any] | None,
     conflicts: Conflicts | None,
     controls: ControlsConfig,
+    elevation: ElevationConfig | None,
 ) -> tuple[Scene, PackReport]:
     """Packs a checked scene into numpy leaves of its own size, without padding but absent agent slots.
 
@@ -147,7 +149,10 @@ def pack(
         segments_cut=cut,
         relief_m=relief,
     )
-    return columns.assemble_columns(Scene, {name: np.asarray(leaf, columns.COLUMNS[name].dtype) for name, leaf in leaves.items()}), report
+    scene = columns.assemble_columns(Scene, {name: np.asarray(leaf, columns.COLUMNS[name].dtype) for name, leaf in leaves.items()})
+    if elevation is not None:
+        scene = replace(scene, elevation=elevation_grid.fit_elevation(raw, origin, half, elevation))
+    return scene, report
 
 
 def _list_drops(dropped: dict[str, int]) -> str:

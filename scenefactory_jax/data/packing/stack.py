@@ -8,9 +8,10 @@ import numpy as np
 from scipy.spatial import KDTree
 
 from scenefactory_jax.core import schema
+from scenefactory_jax.core.pytree import unchecked
 from scenefactory_jax.core.raw_scene import SceneError
 from scenefactory_jax.core.types import Scene
-from scenefactory_jax.data.packing import columns
+from scenefactory_jax.data.packing import columns, elevation_grid
 
 ROUTE_AXES = ("routes", "route_points", "stops", "zones", "controls", "changes")
 AXES = (*columns.ROADS, "agents", "steps", "traffic", *ROUTE_AXES)
@@ -90,7 +91,9 @@ def stack(scenes: Sequence[Scene], *, capacity: Mapping[str, int | None]) -> tup
     cuts: list[CutCounts] = []
     padded = [_fit(world, sizes, index, cuts) for index, world in enumerate(worlds)]
     stacked = {name: np.stack([world[name] for world in padded]) for name in columns.COLUMNS}
-    return columns.assemble_columns(Scene, stacked), CutReport(len(scenes), sizes, tuple(cuts))
+    elevation = elevation_grid.stack_elevations([scene.elevation for scene in scenes])
+    scene = columns.assemble_columns(Scene, stacked)
+    return unchecked(Scene, **vars(scene) | {"elevation": elevation}), CutReport(len(scenes), sizes, tuple(cuts))
 
 
 def describe(report: CutReport) -> list[str]:

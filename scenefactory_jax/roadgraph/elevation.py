@@ -1,0 +1,74 @@
+"""Height and slope of the road by place.
+
+The height is a tensor product of quadratic B-splines over a square grid of coefficients c (C. de Boor, A Practical Guide to Splines,
+chapter IX): with the nearest node (i, j) and the offset (s, t) from it in cells, both in [-1/2, 1/2],
+
+    h = sum_{k, l in -1..1} w_k(t) w_l(s) c[j + k, i + l]       w(t) = ((1/2 - t)^2 / 2, 3/4 - t^2, (1/2 + t)^2 / 2)
+
+Height and slope are continuous, and a plane is exact. Beyond the grid the height goes on along its tangent. Where roads cross on several
+levels, there is one height a level; everywhere else the levels are equal.
+"""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from scenefactory_jax.core.geometry import dot, heading_vector
+from scenefactory_jax.core.pytree import replace
+from scenefactory_jax.core.types import Boxes, Elevation, Scene
+
+
+class Ground(NamedTuple):
+    """The road at places in the plane."""
+
+    height: Float[Array, "*n"]  # m
+    slope: Float[Array, "*n 2"]  # rise over run along x and y
+
+
+def find_ground(elevation: Elevation, position: Float[Array, "*n 2"], near: float | Float[Array, "*n"]) -> Ground:
+    """Computes the road at places, of the level whose height is nearest to `near`, m."""
+    near = jnp.broadcast_to(near, position.shape[:-1])
+    if position.ndim == 1:
+        return _find_ground(elevation, position, near)
+    find = jax.vmap(lambda place, height: _find_ground(elevation, place, height))
+    flat = find(position.reshape(-1, 2), near.reshape(-1))
+    return Ground(flat.height.reshape(near.shape), flat.slope.reshape(position.shape))
+
+
+def _find_ground(elevation: Elevation, position: Float[Array, "2"], near: Float[Array, ""]) -> Ground:
+    levels, rows, columns = elevation.height.shape
+    place = (position - elevation.origin) / elevation.cell_m
+    node = jnp.clip(jnp.floor(place + 0.5), 1, jnp.array([columns - 2, rows - 2]))
+    offset = place - node
+    inside = jnp.clip(offset, -0.5, 0.5)
+    first = node.astype(jnp.int32) - 1
+    patch = jax.lax.dynamic_slice(elevation.height, (0, first[1], first[0]), (levels, 3, 3))
+    (along_x, slope_x), (along_y, slope_y) = _weigh(inside[0]), _weigh(inside[1])
+    sums = [(patch * (y[:, None] * x)).sum((1, 2)) for y, x in ((along_y, along_x), (along_y, slope_x), (slope_y, along_x))]
+    slope = jnp.stack(sums[1:], axis=-1)  # per cell
+    height = sums[0] + dot(slope, offset - inside)
+    level = jnp.argmin(jnp.abs(height - near))
+    return Ground(height[level], slope[level] / elevation.cell_m)
+
+
+def _weigh(offset: Float[Array, ""]) -> tuple[Float[Array, "3"], Float[Array, "3"]]:
+    """The weights of three coefficients, and their derivatives."""
+    weights = jnp.stack([0.5 * (0.5 - offset) ** 2, 0.75 - offset**2, 0.5 * (0.5 + offset) ** 2])
+    return weights, jnp.stack([offset - 0.5, -2.0 * offset, offset + 0.5])
+
+
+def compute_grade(ground: Ground, yaw: Float[Array, "*n"]) -> tuple[Float[Array, "*n"], Float[Array, "*n"]]:
+    """Computes sine and cosine of the road's angle along a heading."""
+    rise = dot(ground.slope, heading_vector(yaw))
+    cosine = 1.0 / jnp.sqrt(1.0 + rise**2)
+    return rise * cosine, cosine
+
+
+def lift_boxes(scene: Scene, boxes: Boxes) -> Boxes:
+    """Places boxes whose elevations are above a flat road on the road of the scene."""
+    if scene.elevation is None:
+        return boxes
+    ground = find_ground(scene.elevation, boxes.position, 0.0)
+    return replace(boxes, elevation=boxes.elevation + ground.height)
