@@ -51,6 +51,7 @@ class Road:
     polyline: Int[Array, " P"]  # index into RawScene.roads
     arc: Float[Array, " P"]  # arc length along the polyline at the midpoint
     valid: Bool[Array, " P"]
+    height: Float[Array, " P"] | None = None  # of the midpoint; None: the scene has one level
 
 
 @pytree_dataclass

@@ -15,9 +15,12 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from scenefactory_jax.core.geometry import dot, heading_vector
-from scenefactory_jax.core.pytree import replace
-from scenefactory_jax.core.types import Boxes, Elevation, Scene
+from scenefactory_jax.core.geometry import cross, dot, heading_vector
+from scenefactory_jax.core.pytree import replace, unchecked
+from scenefactory_jax.core.types import Boxes, Elevation, Motion, Road, Scene
+
+LEVEL_M = 2.5  # what is higher or lower by more is on another level: a car is lower, a bridge is higher
+TURN_M = 10.0  # see `find_ground_by_lane`
 
 
 class Ground(NamedTuple):
@@ -66,9 +69,59 @@ def compute_grade(ground: Ground, yaw: Float[Array, "*n"]) -> tuple[Float[Array,
     return rise * cosine, cosine
 
 
+def find_start_ground(scene: Scene) -> Ground | None:
+    """Computes the road under the agents' starts."""
+    return find_ground_by_lane(scene, scene.agents.position, scene.agents.yaw)
+
+
+def find_ground_by_lane(scene: Scene, position: Float[Array, "*n 2"], yaw: Float[Array, "*n"]) -> Ground | None:
+    """Computes the road under road users of unknown height, on the level of the lane that they are on; None if the road is flat.
+
+    That lane is near and along their heading: one across it counts as TURN_M farther.
+    """
+    if scene.elevation is None:
+        return None
+    near = jnp.zeros_like(yaw)
+    if scene.lanes.height is not None and scene.lanes.height.shape[0]:
+        offset = position[..., None, :] - scene.lanes.midpoint
+        across = TURN_M * cross(heading_vector(yaw)[..., None, :], scene.lanes.direction)
+        lane = jnp.argmin(jnp.where(scene.lanes.valid, dot(offset, offset) + across**2, jnp.inf), axis=-1)
+        near = scene.lanes.height[lane]
+    return find_ground(scene.elevation, position, near)
+
+
+def lift_motion(motion: Motion, ground: Ground | None) -> Motion:
+    """Places cars that move over a flat road, at their heights above it, on the road under them."""
+    if ground is None:
+        return motion
+    climb = dot(ground.slope, motion.velocity[:, :2])
+    return replace(
+        motion,
+        position=motion.position.at[:, 2].add(ground.height),
+        velocity=motion.velocity.at[:, 2].set(climb),
+        upright=motion.upright / jnp.sqrt(1.0 + dot(ground.slope, ground.slope)),
+    )
+
+
 def lift_boxes(scene: Scene, boxes: Boxes) -> Boxes:
     """Places boxes whose elevations are above a flat road on the road of the scene."""
-    if scene.elevation is None:
-        return boxes
-    ground = find_ground(scene.elevation, boxes.position, 0.0)
-    return replace(boxes, elevation=boxes.elevation + ground.height)
+    ground = find_ground_by_lane(scene, boxes.position, boxes.yaw)
+    return boxes if ground is None else replace(boxes, elevation=boxes.elevation + ground.height)
+
+
+def measure_heights(scene: Scene, motion: Motion) -> Float[Array, " A"]:
+    """Computes the heights of cars above the road, m."""
+    height = motion.position[:, 2]
+    return height if scene.elevation is None else height - find_ground(scene.elevation, motion.position[:, :2], height).height
+
+
+def select_level(scene: Scene, motion: Motion) -> Scene:
+    """Restricts lanes and edges to those of each agent's level: their masks become [A, P]. Roads of one level stay as they are."""
+
+    def select(road: Road) -> Road:
+        if road.height is None:
+            return road
+        beside = jnp.abs(road.height - motion.position[:, 2:]) < LEVEL_M
+        return unchecked(Road, **vars(road) | {"valid": road.valid & beside})
+
+    return unchecked(Scene, **vars(scene) | {"lanes": select(scene.lanes), "edges": select(scene.edges)})

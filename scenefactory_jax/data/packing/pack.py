@@ -113,7 +113,8 @@ def pack(
         Unpackable: no lane segment in the box, or no agent where one is required.
     """
     (origin, centred_on), half = _find_centre(raw, centre), scene_size_m / 2
-    road, cut, relief = _segments(raw, origin, half, gap_m, outline_m)
+    levels = 1 if elevation is None else elevation.levels
+    road, cut, relief = _segments(raw, origin, half, gap_m, outline_m, heights=levels > 1)
     logs = stack_tracks(raw.tracks, len(raw.times))
     logs = logs._replace(xyz=logs.xyz - np.array([origin[0], origin[1], 0.0]))
     allowed = np.ones(len(raw.tracks), bool) if conflicts is None else find_conflicts(raw, logs, conflicts)
@@ -149,7 +150,8 @@ def pack(
         segments_cut=cut,
         relief_m=relief,
     )
-    scene = columns.assemble_columns(Scene, {name: np.asarray(leaf, columns.COLUMNS[name].dtype) for name, leaf in leaves.items()})
+    dtypes = {name: column.dtype for name, column in columns.columns_of(leaves).items()}
+    scene = columns.assemble_columns(Scene, {name: np.asarray(leaf, dtypes[name]) for name, leaf in leaves.items()})
     if elevation is not None:
         scene = replace(scene, elevation=elevation_grid.fit_elevation(raw, origin, half, elevation))
     return scene, report
@@ -200,7 +202,7 @@ def _find_centre(raw: RawScene, centre: str) -> tuple[Float[np.ndarray, "3"], st
 
 
 def _segments(
-    raw: RawScene, origin: Float[np.ndarray, "3"], half: float, gap_m: float, outline_m: float
+    raw: RawScene, origin: Float[np.ndarray, "3"], half: float, gap_m: float, outline_m: float, *, heights: bool
 ) -> tuple[dict[str, np.ndarray], dict[str, int], float]:
     """Columns of `road` in storage order, the count of segments cut by reason, and the heights' range."""
     order = sorted((i for i, line in enumerate(raw.roads) if len(line.xyz) >= 2), key=lambda i: raw.roads[i].kind)  # stable
@@ -232,6 +234,8 @@ def _segments(
         "road.polyline": np.array(order)[line],
         "road.valid": np.ones(len(rows), bool),
     }
+    if heights:
+        road["road.height"] = (xyz[rows + 1, 2] + xyz[rows, 2]) / 2 - origin[2]
     if not np.isin(kind[line], DRIVABLE).any():
         place = f"{half:g} m of {np.round(origin, 2).tolist()}"
         raise Unpackable("no_lane_in_box", f"{raw.source}: roads: no driving lane within {place}; cut: {cut}")

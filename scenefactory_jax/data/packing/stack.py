@@ -90,8 +90,8 @@ def stack(scenes: Sequence[Scene], *, capacity: Mapping[str, int | None]) -> tup
         sizes[axis] = round_rows(axis, max(int(axis not in MAY_BE_EMPTY), *(_count(world, axis) for world in worlds)))
     cuts: list[CutCounts] = []
     padded = [_fit(world, sizes, index, cuts) for index, world in enumerate(worlds)]
-    stacked = {name: np.stack([world[name] for world in padded]) for name in columns.COLUMNS}
     elevation = elevation_grid.stack_elevations([scene.elevation for scene in scenes])
+    stacked = {name: np.stack([world[name] for world in padded]) for name in columns.columns_of(padded[0])}
     scene = columns.assemble_columns(Scene, stacked)
     return unchecked(Scene, **vars(scene) | {"elevation": elevation}), CutReport(len(scenes), sizes, tuple(cuts))
 
@@ -124,7 +124,7 @@ def _count(world: Leaves, axis: str) -> int:
 def _take(world: Leaves, axis: str, rows: np.ndarray) -> Leaves:
     """The world with only these rows of an axis."""
     taken = dict(world)
-    for name, column in columns.COLUMNS.items():
+    for name, column in columns.columns_of(world).items():
         for place in [place for place, other in enumerate(column.axes) if other == axis]:
             taken[name] = np.take(taken[name], rows, axis=place)
     return taken
@@ -168,7 +168,7 @@ def _find_nearest(world: Leaves, part: str, rows: int) -> tuple[np.ndarray, floa
 
 def _pad(name: str, leaf: np.ndarray, sizes: Mapping[str, int]) -> np.ndarray:
     """Adds zeros and false masks behind the rows; sizes of absent cars repeat the last, because they are divisors."""
-    axes = columns.COLUMNS[name].axes
+    axes = columns.columns_of({name})[name].axes
     missing = [(0, sizes[axis] - rows if isinstance(axis, str) else 0) for axis, rows in zip(axes, leaf.shape, strict=True)]
     if not any(after for _, after in missing):
         return leaf

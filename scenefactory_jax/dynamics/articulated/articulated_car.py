@@ -34,6 +34,7 @@ from scenefactory_jax.dynamics.articulated.tyres import (
 )
 from scenefactory_jax.dynamics.articulated.vector import Vector, dot
 from scenefactory_jax.dynamics.collision import Contact, ContactState, advance_boxes, collect_boxes
+from scenefactory_jax.roadgraph.elevation import find_start_ground
 
 
 class CarCarry(NamedTuple):
@@ -166,7 +167,7 @@ def init(compiled: CompiledCar, contact: Contact, key: PRNGKeyArray, scene: Scen
     radius = jnp.broadcast_to((constants or compiled.constants).car.wheel_radius, (count,))
     qvel = jnp.zeros((count, 16), jnp.float32).at[:, :2].set(velocity)
     if scene.elevation is not None:
-        qpos, qvel = jax.vmap(functools.partial(states.place_on_road, scene.elevation))(qpos, qvel)
+        qpos, qvel = jax.vmap(states.place_on_road)(find_start_ground(scene), qpos, qvel)
     return Body(
         qpos=qpos,
         qvel=qvel.at[:, at.spin_v].set((agents.speed / radius)[:, None]),

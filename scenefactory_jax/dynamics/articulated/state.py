@@ -9,7 +9,7 @@ from jaxtyping import Array, Float
 from scenefactory_jax.core.types import Elevation
 from scenefactory_jax.dynamics.articulated.parameters import AHEAD, LEFT, CarParameters
 from scenefactory_jax.dynamics.articulated.vector import Number, Vector, dot, length
-from scenefactory_jax.roadgraph.elevation import find_ground
+from scenefactory_jax.roadgraph.elevation import Ground, find_ground
 
 TINY = 1e-6  # rad/s
 
@@ -59,9 +59,8 @@ def _find_road(
     return (z - ground.height) * upright - dot(normal, hub), normal
 
 
-def place_on_road(elevation: Elevation, qpos: Float[Array, "17"], qvel: Float[Array, "16"]) -> tuple[Array, Array]:
+def place_on_road(ground: Ground, qpos: Float[Array, "17"], qvel: Float[Array, "16"]) -> tuple[Array, Array]:
     """Places an upright car over a flat road at height 0 on the road at its place: tilted, with its velocity, by the shortest turn."""
-    ground = find_ground(elevation, qpos[:2], 0.0)
     x, y = ground.slope
     upright = 1.0 / jnp.sqrt(1.0 + x**2 + y**2)
     tilt = jnp.stack([1.0 + upright, y * upright, -x * upright, jnp.zeros_like(x)])  # from the world's up to the normal
