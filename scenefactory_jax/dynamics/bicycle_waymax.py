@@ -1,7 +1,8 @@
 """Waymax's invertible bicycle: acceleration and curvature in place of pedals and a steering angle, and its inverse.
 
 Formulas: Waymax (arXiv:2310.08710). The speed is the length of the velocity, so a car that brakes below zero moves backwards in
-that step and forwards in the next. On a road with heights, motion and velocity are those seen from above. Contact forces are computed as between articulated cars; they are reported and do not move the cars.
+that step and forwards in the next. On a road with heights, motion and velocity are those seen from above. Contact forces are computed as
+between articulated cars; they are reported and do not move the cars.
 """
 
 import functools

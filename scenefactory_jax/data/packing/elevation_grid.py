@@ -12,7 +12,7 @@ from typing import Annotated
 import numpy as np
 import scipy.sparse
 import scipy.sparse.linalg
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 from scipy.spatial import KDTree
 
 from scenefactory_jax.core.pytree import unchecked
@@ -23,6 +23,8 @@ from scenefactory_jax.data.formats.polylines import densify
 
 KINDS = (LANE_FREEWAY, LANE_STREET, LANE_BIKE, *LINES, *EDGES)  # whose points lie on the road; stop signs stand above it
 RIM = 2  # cells around the square
+OVERLAP = 1.5  # cells, within which two heights are those of one place
+APART = 5.0  # cells, over which a level may go from the height of one road to that of another
 
 
 @dataclass(frozen=True)
@@ -47,10 +49,7 @@ def fit_elevation(raw: RawScene, origin: Float[np.ndarray, "3"], half: float, co
     lines = [densify(line.xyz, config.spacing_m) - origin for line in raw.roads if line.kind in KINDS and len(line.xyz) >= 2]
     points = np.concatenate([np.zeros((0, 3)), *lines])
     points = _thin(points[(np.abs(points[:, :2]) <= -corner - config.cell_m).all(axis=1)], config.spacing_m)
-    below, above = _count_levels(points, config)
-    if len(points) and (deepest := int((below + above).max()) + 1) > config.levels:
-        reason = f"{raw.source}: roads: {deepest} levels within {config.rise_m:g} m; scenes.pack.elevation.levels is {config.levels}"
-        raise Unpackable("levels", reason)
+    below, above = _assign_levels(points, config, raw.source)
     basis, bending = _evaluate_basis((points[:, :2] - corner) / config.cell_m, nodes), config.smoothing * _measure_bending(nodes)
     height = np.zeros((config.levels, nodes, nodes), np.float32)
     for level in range(config.levels):
@@ -80,13 +79,31 @@ def _thin(points: Float[np.ndarray, "N 3"], spacing_m: float) -> Float[np.ndarra
     return points[np.sort(np.unique(np.floor(points / spacing_m).astype(int), axis=0, return_index=True)[1])]
 
 
-def _count_levels(points: Float[np.ndarray, "N 3"], config: ElevationConfig) -> tuple[Int[np.ndarray, " N"], Int[np.ndarray, " N"]]:
-    """Levels below and above each point, among the points within three cells: their heights in order, divided at gaps of `rise_m`."""
+def _assign_levels(points: Float[np.ndarray, "N 3"], config: ElevationConfig, source: str) -> tuple[np.ndarray, np.ndarray]:
+    """Levels that lie below and above each point: it belongs to none of them, but to all others.
+
+    Raises:
+        Unpackable: more levels at one place than `config.levels`.
+    """
     below, above = np.zeros((2, len(points)), int)
     if not len(points) or np.ptp(points[:, 2]) <= config.rise_m:
         return below, above
+    below, above = _count_levels(points, config, OVERLAP * config.cell_m)
+    if (deepest := int((below + above).max()) + 1) > config.levels:
+        raise Unpackable("levels", f"{source}: roads: {deepest} levels at one place; scenes.pack.elevation.levels is {config.levels}")
+    if deepest > 1:
+        below, above = _count_levels(points, config, APART * config.cell_m)
+    below = np.minimum(below, config.levels - 1)
+    return below, np.minimum(above, config.levels - 1 - below)
+
+
+def _count_levels(
+    points: Float[np.ndarray, "N 3"], config: ElevationConfig, reach_m: float
+) -> tuple[Int[np.ndarray, " N"], Int[np.ndarray, " N"]]:
+    """Levels below and above each point, among the points within a reach: their heights in order, divided at gaps of `rise_m`."""
+    below, above = np.zeros((2, len(points)), int)
     coarse = _thin(points, config.cell_m)
-    near = KDTree(coarse[:, :2]).query_ball_point(points[:, :2], 3.0 * config.cell_m)
+    near = KDTree(coarse[:, :2]).query_ball_point(points[:, :2], reach_m)
     for row, others in enumerate(near):
         height = np.sort(np.append(coarse[others, 2], points[row, 2]))
         gaps = height[1:][np.diff(height) > config.rise_m]  # lowest heights of the levels but the first

@@ -10,10 +10,11 @@ from typing import Annotated, Any, Literal, NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float
 
+from scenefactory_jax.core.pytree import unchecked
 from scenefactory_jax.core.raw_scene import Polyline, RawScene, Unpackable
 from scenefactory_jax.core.scene_arrays import Logs, join_lines, segment_lengths, stack_tracks, wrap_angles
 from scenefactory_jax.core.schema import Bounds, ConfigError, Positive
-from scenefactory_jax.core.types import DRIVABLE, POLYGONS, ROAD_USERS, Scene
+from scenefactory_jax.core.types import DRIVABLE, POLYGONS, ROAD_USERS, Elevation, Scene
 from scenefactory_jax.data.formats.polylines import densify
 from scenefactory_jax.data.packing import columns, control_columns, drawn_starts, elevation_grid, route_columns, route_conflicts
 from scenefactory_jax.data.packing.control_columns import ControlsConfig
@@ -113,8 +114,7 @@ def pack(
         Unpackable: no lane segment in the box, or no agent where one is required.
     """
     (origin, centred_on), half = _find_centre(raw, centre), scene_size_m / 2
-    levels = 1 if elevation is None else elevation.levels
-    road, cut, relief = _segments(raw, origin, half, gap_m, outline_m, heights=levels > 1)
+    road, cut, relief = _segments(raw, origin, half, gap_m, outline_m, elevation)
     logs = stack_tracks(raw.tracks, len(raw.times))
     logs = logs._replace(xyz=logs.xyz - np.array([origin[0], origin[1], 0.0]))
     allowed = np.ones(len(raw.tracks), bool) if conflicts is None else find_conflicts(raw, logs, conflicts)
@@ -128,10 +128,9 @@ def pack(
     leaves["log.dt"] = np.median(np.diff(raw.times)) if len(raw.times) > 1 else np.ones(())
     beside, others, traffic_dropped = _traffic(raw, logs, chosen, leaves, half, first, traffic, min_traffic_size_m)
     stops = control_columns.pack_controls(raw, origin, half, controls)
-    leaves |= beside | stops.columns
     who = {"agents": chosen, "slots": agents, "traffic": others, "size": beside["traffic_log.size"]}
     added, counts = _routes(raw, logs, origin, half, **who, controls=stops.columns, config=routes)
-    leaves |= added
+    leaves |= beside | stops.columns | added
     if starts is not None:
         leaves |= drawn_starts.draw_agents(leaves, starts, row=raw.current - first, slots=agents, car_size_m=car_size_m)
     if require_agents and not leaves["agents.present"].any():
@@ -150,11 +149,15 @@ def pack(
         segments_cut=cut,
         relief_m=relief,
     )
+    heights = None if elevation is None else elevation_grid.fit_elevation(raw, origin, half, elevation)
+    return _assemble(leaves, heights), report
+
+
+def _assemble(leaves: dict[str, np.ndarray], elevation: Elevation | None) -> Scene:
+    """The scene of these columns."""
     dtypes = {name: column.dtype for name, column in columns.columns_of(leaves).items()}
     scene = columns.assemble_columns(Scene, {name: np.asarray(leaf, dtypes[name]) for name, leaf in leaves.items()})
-    if elevation is not None:
-        scene = replace(scene, elevation=elevation_grid.fit_elevation(raw, origin, half, elevation))
-    return scene, report
+    return unchecked(Scene, **vars(scene) | {"elevation": elevation})
 
 
 def _list_drops(dropped: dict[str, int]) -> str:
@@ -202,7 +205,7 @@ def _find_centre(raw: RawScene, centre: str) -> tuple[Float[np.ndarray, "3"], st
 
 
 def _segments(
-    raw: RawScene, origin: Float[np.ndarray, "3"], half: float, gap_m: float, outline_m: float, *, heights: bool
+    raw: RawScene, origin: Float[np.ndarray, "3"], half: float, gap_m: float, outline_m: float, elevation: ElevationConfig | None
 ) -> tuple[dict[str, np.ndarray], dict[str, int], float]:
     """Columns of `road` in storage order, the count of segments cut by reason, and the heights' range."""
     order = sorted((i for i, line in enumerate(raw.roads) if len(line.xyz) >= 2), key=lambda i: raw.roads[i].kind)  # stable
@@ -234,7 +237,7 @@ def _segments(
         "road.polyline": np.array(order)[line],
         "road.valid": np.ones(len(rows), bool),
     }
-    if heights:
+    if elevation is not None and elevation.levels > 1:
         road["road.height"] = (xyz[rows + 1, 2] + xyz[rows, 2]) / 2 - origin[2]
     if not np.isin(kind[line], DRIVABLE).any():
         place = f"{half:g} m of {np.round(origin, 2).tolist()}"

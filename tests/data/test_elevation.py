@@ -1,0 +1,128 @@
+"""Heights of packed scenes: planes, bridges and hills, and what stands on them."""
+
+from dataclasses import replace
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from scenefactory_jax.cli.hydra_config import load_config
+from scenefactory_jax.core.instantiate import ConfigError
+from scenefactory_jax.core.raw_scene import Polyline, RawScene, Track, Unpackable
+from scenefactory_jax.core.types import DRIVABLE, Boxes
+from scenefactory_jax.data.loading import scene_source
+from scenefactory_jax.data.packing import elevation_grid
+from scenefactory_jax.data.packing.stack import stack
+from scenefactory_jax.dynamics import bicycle
+from scenefactory_jax.dynamics.articulated.parameters import GRAVITY
+from scenefactory_jax.roadgraph import elevation
+from scenefactory_jax.roadgraph.elevation import Ground
+
+LINE = np.linspace(-90.0, 90.0, 181)
+SLOPE, BRIDGE_M = np.array([0.06, -0.02]), 6.0
+
+
+def lane(id, start, direction, height, *, kind=2):
+    xy = np.array(start) + LINE[:, None] * np.array(direction)
+    return Polyline(kind=kind, xyz=np.column_stack([xy, height(xy)]), id=id)
+
+
+def driver(id, place, yaw, height):
+    xyz = np.tile([*place, height], (3, 1)).astype(float)
+    return Track(id, "vehicle", (4.0, 2.0, 1.5), xyz, np.full(3, yaw), np.zeros((3, 2)), np.ones(3, bool))
+
+
+def scene_with(*roads, tracks=()):
+    return RawScene("made", "by hand", roads, tuple(tracks), 0.1 * np.arange(3), current=0, sdc=0, metadata={})
+
+
+def pack(raw, *changes):
+    config = load_config("train", "scenes=womd", "scenes/pack/elevation=hills", "scenes.pack.require_agents=false", *changes)
+    return scene_source.prepare(raw, **scene_source.make_packing(config["scenes"])).scene
+
+
+@pytest.fixture(scope="module")
+def crossing():
+    """A street along x, a bridge over it along y, and a car on each of them, 1 m beside the other's line."""
+    plain, bridge = lambda xy: 0 * xy[:, 0], lambda xy: BRIDGE_M * np.exp(-((xy[:, 1] / 40.0) ** 2))
+    roads = [lane(1, (0, y), (1, 0), plain) for y in (-2.0, 2.0)] + [lane(2, (x, 0), (0, 1), bridge) for x in (-2.0, 2.0)]
+    roads += [lane(3, (0, 5), (1, 0), plain, kind=15), lane(4, (5, 0), (0, 1), bridge, kind=15)]
+    return scene_with(*roads, tracks=[driver(1, (-1.0, 2.0), 0.0, 0.0), driver(2, (2.0, 1.0), np.pi / 2, BRIDGE_M)])
+
+
+def test_a_plane_is_exact_where_the_map_is_and_beyond():
+    roads = [lane(i, (0, y), (1, 0), lambda xy: xy @ SLOPE + 300.0) for i, y in enumerate((-3.5, 0.0, 3.5))]
+    scene = pack(scene_with(*roads, tracks=[driver(1, (0, 0), 0.0, 300.0)]))
+    places = jnp.array([[0.0, 0.0], [37.1, -2.2], [-80.3, 60.0], [150.0, -120.0]])
+    ground = elevation.find_ground(scene.elevation, places, 0.0)
+    np.testing.assert_allclose(ground.height, places @ SLOPE, atol=2e-3)
+    np.testing.assert_allclose(ground.slope, np.tile(SLOPE, (4, 1)), atol=1e-4)
+    sine, cosine = elevation.compute_grade(ground, jnp.full(4, np.pi))
+    np.testing.assert_allclose(sine / cosine, -SLOPE[0], atol=1e-4)
+    assert scene.road.height is None
+
+
+def test_levels_are_told_apart_by_height_and_by_the_lanes_direction(crossing):
+    with pytest.raises(Unpackable, match=r"roads: 2 levels at one place; scenes\.pack\.elevation\.levels is 1"):
+        pack(crossing)
+    scene = pack(crossing, "scenes.pack.elevation.levels=2")
+    for road in crossing.roads:
+        points = jnp.asarray(road.xyz, jnp.float32)
+        np.testing.assert_allclose(elevation.find_ground(scene.elevation, points[:, :2], points[:, 2]).height, points[:, 2], atol=0.05)
+    start = elevation.find_start_ground(scene)
+    assert start is not None
+    np.testing.assert_allclose(start.height[:2], [0.0, BRIDGE_M], atol=0.15)
+    zero = jnp.zeros(2)
+    boxes = Boxes(scene.agents.position[:2], zero + 0.7, scene.agents.yaw[:2], jnp.zeros((2, 2)), zero, jnp.ones((2, 2)), zero, zero == 0)
+    lifted = elevation.lift_boxes(scene, boxes).elevation
+    np.testing.assert_allclose(lifted, [0.7, BRIDGE_M + 0.7], atol=0.15)
+    motion = bicycle.read(bicycle.init(None, scene), height=0.7)
+    np.testing.assert_allclose(motion.position[:2, 2], lifted, atol=1e-4)
+    edges = elevation.select_level(scene, motion).edges.valid[:2]
+    near = np.linalg.norm(np.asarray(scene.edges.midpoint) - np.asarray(scene.agents.position[0]), axis=1) < 10.0
+    along = np.abs(np.asarray(scene.edges.direction)[:, 0]) > 0.5
+    assert edges[0, near & along].all() and not edges[0, near & ~along].any()
+    assert edges[1, near & ~along].all() and not edges[1, near & along].any()
+
+
+def test_stacked_scenes_have_heights_of_one_size_or_none(crossing):
+    two = pack(crossing, "scenes.pack.elevation.levels=2")
+    stacked, _ = stack([two, two], capacity={})
+    assert stacked.elevation.height.shape == (2, *two.elevation.height.shape) and stacked.edges.height.shape[0] == 2
+    flat = pack(replace(crossing, roads=crossing.roads[:2], tracks=crossing.tracks[:1]), "scenes/pack/elevation=flat")
+    assert flat.elevation is None
+    with pytest.raises(ConfigError, match=r"^scenes\.pack\.elevation: expected the same sizes in all scenes, got \(2, 55, 55\), None$"):
+        elevation_grid.stack_elevations([two.elevation, flat.elevation])
+
+
+def test_a_bicycle_feels_the_grade_along_its_heading():
+    limits = bicycle.Limits(2.7, 1.35, 0.6, 3.0, 6.0, 0.1, 0.0, 0.0, 60.0)
+    zero, yaw = jnp.zeros(4), jnp.array([0.0, np.pi / 2, np.pi, 0.0])
+    ground = Ground(zero, jnp.tile(jnp.array([0.1, 0.0]), (4, 1)))
+    body = bicycle.Body(jnp.zeros((4, 2)), yaw, jnp.array([10.0, 10.0, 10.0, 0.0]), *[zero] * 6, ground=ground)
+    after = bicycle.integrate_bicycle(body, jnp.zeros((4, 3)), limits, dt=0.1)
+    sine = 0.1 / np.hypot(1.0, 0.1)
+    np.testing.assert_allclose((after.speed - body.speed) / 0.1, [-0.1 - GRAVITY * sine, -0.1, -0.1 + GRAVITY * sine, 0.0], rtol=1e-3)
+    motion = bicycle.read(body, height=0.7)
+    np.testing.assert_allclose(np.linalg.norm(motion.velocity, axis=1), body.speed, rtol=1e-5)
+    np.testing.assert_allclose(motion.velocity[:, 2], [10 * sine, 0.0, -10 * sine, 0.0], atol=1e-5)
+
+
+def test_a_town_on_hills_is_the_town_with_heights():
+    flat, hilly = (
+        scene_source.make_generator(load_config("train", "scenes=streets", *changes)["scenes"])(0, 2)
+        for changes in ([], ["scenes.generate.hills={grade: [0.08, 0.08], wave_m: [100.0, 200.0]}"])
+    )
+    steepest = 0.0
+    for before, after in zip(flat.roads, hilly.roads, strict=True):
+        np.testing.assert_array_equal(before.xyz[:, :2], after.xyz[:, :2])
+        if after.kind in DRIVABLE:
+            step = np.diff(after.xyz, axis=0)
+            steepest = max(steepest, float(np.max(np.abs(step[:, 2]) / np.linalg.norm(step[:, :2], axis=1))))
+    assert steepest == pytest.approx(0.08, rel=1e-6)
+    for track in hilly.tracks:
+        lanes = np.concatenate([line.xyz for line in hilly.roads if line.kind in DRIVABLE])
+        place = track.xyz[track.valid][0]
+        nearest = lanes[np.argmin(np.linalg.norm(lanes[:, :2] - place[:2], axis=1))]
+        apart = np.linalg.norm(nearest[:2] - place[:2])
+        assert abs(place[2] - track.size[2] / 2 - nearest[2]) <= 0.2 * apart + 1e-3
