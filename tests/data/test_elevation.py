@@ -8,6 +8,7 @@ import pytest
 
 from scenefactory_jax.cli.hydra_config import load_config
 from scenefactory_jax.core.instantiate import ConfigError
+from scenefactory_jax.core.pytree import to_jax
 from scenefactory_jax.core.raw_scene import Polyline, RawScene, Track, Unpackable
 from scenefactory_jax.core.types import DRIVABLE, Boxes
 from scenefactory_jax.data.loading import scene_source
@@ -38,7 +39,7 @@ def scene_with(*roads, tracks=()):
 
 def pack(raw, *changes):
     config = load_config("train", "scenes=womd", "scenes/pack/elevation=hills", "scenes.pack.require_agents=false", *changes)
-    return scene_source.prepare(raw, **scene_source.make_packing(config["scenes"])).scene
+    return to_jax(scene_source.prepare(raw, **scene_source.make_packing(config["scenes"])).scene)
 
 
 @pytest.fixture(scope="module")
@@ -67,7 +68,7 @@ def test_levels_are_told_apart_by_height_and_by_the_lanes_direction(crossing):
         pack(crossing)
     scene = pack(crossing, "scenes.pack.elevation.levels=2")
     for road in crossing.roads:
-        points = jnp.asarray(road.xyz, jnp.float32)
+        points = jnp.asarray(road.xyz - [-1.0, 2.0, 0.0], jnp.float32)  # around the first car
         np.testing.assert_allclose(elevation.find_ground(scene.elevation, points[:, :2], points[:, 2]).height, points[:, 2], atol=0.05)
     start = elevation.find_start_ground(scene)
     assert start is not None

@@ -126,8 +126,7 @@ def _evaluate_basis(place: Float[np.ndarray, "N 2"], nodes: int) -> scipy.sparse
 
 def _measure_bending(nodes: int) -> scipy.sparse.csr_array:
     """The matrix of the summed squared second differences: along both axes, and twice the mixed ones (a thin plate's energy)."""
-    one = scipy.sparse.eye_array(nodes)
-    first = scipy.sparse.diags_array([-1.0, 1.0], offsets=[0, 1], shape=(nodes - 1, nodes))
-    second = scipy.sparse.diags_array([1.0, -2.0, 1.0], offsets=[0, 1, 2], shape=(nodes - 2, nodes))
+    one = np.eye(nodes)
+    first, second = np.diff(one, axis=0), np.diff(one, 2, axis=0)
     parts = scipy.sparse.kron(one, second), scipy.sparse.kron(second, one), np.sqrt(2.0) * scipy.sparse.kron(first, first)
     return scipy.sparse.csr_array(sum(part.T @ part for part in parts))

@@ -166,8 +166,8 @@ def init(compiled: CompiledCar, contact: Contact, key: PRNGKeyArray, scene: Scen
     velocity = agents.speed[:, None] * heading_vector(agents.yaw)
     radius = jnp.broadcast_to((constants or compiled.constants).car.wheel_radius, (count,))
     qvel = jnp.zeros((count, 16), jnp.float32).at[:, :2].set(velocity)
-    if scene.elevation is not None:
-        qpos, qvel = jax.vmap(states.place_on_road)(find_start_ground(scene), qpos, qvel)
+    if (ground := find_start_ground(scene)) is not None:
+        qpos, qvel = jax.vmap(states.place_on_road)(ground, qpos, qvel)
     return Body(
         qpos=qpos,
         qvel=qvel.at[:, at.spin_v].set((agents.speed / radius)[:, None]),

@@ -24,7 +24,7 @@ class Hills:
 def add_hills(raw: RawScene, rng: np.random.Generator, hills: Hills) -> RawScene:
     """Lifts a flat scene, all that lies and stands on its roads included; no driving lane is steeper than the drawn grade."""
     direction, phase = rng.uniform(0.0, 2 * np.pi, (2, WAVES, 1))
-    number = 2 * np.pi / rng.uniform(*hills.wave_m, (WAVES, 1)) * np.concatenate([np.cos(direction), np.sin(direction)], axis=1)
+    number = 2 * np.pi / rng.uniform(hills.wave_m[0], hills.wave_m[1], (WAVES, 1)) * np.concatenate([np.cos(direction), np.sin(direction)], axis=1)
     share = rng.uniform(0.5, 1.0, (WAVES, 1)) / np.linalg.norm(number, axis=1, keepdims=True)  # each wave is about as steep
 
     def compute_heights(xy: Float[np.ndarray, "N 2"]) -> Float[np.ndarray, " N"]:
@@ -34,7 +34,7 @@ def add_hills(raw: RawScene, rng: np.random.Generator, hills: Hills) -> RawScene
     rise = np.concatenate([np.diff(compute_heights(xy)) for xy in lanes])
     run = np.concatenate([np.linalg.norm(np.diff(xy, axis=0), axis=1) for xy in lanes])
     steepest = float(np.max(np.abs(rise) / np.maximum(run, 1e-6)))
-    scale, middle = rng.uniform(*hills.grade) / steepest, np.zeros((1, 2))
+    scale, middle = rng.uniform(hills.grade[0], hills.grade[1]) / steepest, np.zeros((1, 2))
 
     def lift(xyz: Float[np.ndarray, "N 3"]) -> Float[np.ndarray, "N 3"]:
         height = scale * (compute_heights(xyz[:, :2]) - compute_heights(middle))
