@@ -38,7 +38,7 @@ def scene_with(*roads, tracks=()):
 
 
 def pack(raw, *changes):
-    config = load_config("train", "scenes=womd", "scenes/pack/elevation=hills", "scenes.pack.require_agents=false", *changes)
+    config = load_config("train", "scenes=womd", "scenes/pack/elevation=hills", "scenes.pack.min_travel_m=-1", *changes)
     return to_jax(scene_source.prepare(raw, **scene_source.make_packing(config["scenes"])).scene)
 
 

@@ -24,7 +24,8 @@ class Hills:
 def add_hills(raw: RawScene, rng: np.random.Generator, hills: Hills) -> RawScene:
     """Lifts a flat scene, all that lies and stands on its roads included; no driving lane is steeper than the drawn grade."""
     direction, phase = rng.uniform(0.0, 2 * np.pi, (2, WAVES, 1))
-    number = 2 * np.pi / rng.uniform(hills.wave_m[0], hills.wave_m[1], (WAVES, 1)) * np.concatenate([np.cos(direction), np.sin(direction)], axis=1)
+    number = np.concatenate([np.cos(direction), np.sin(direction)], axis=1)
+    number = number * 2 * np.pi / rng.uniform(hills.wave_m[0], hills.wave_m[1], (WAVES, 1))
     share = rng.uniform(0.5, 1.0, (WAVES, 1)) / np.linalg.norm(number, axis=1, keepdims=True)  # each wave is about as steep
 
     def compute_heights(xy: Float[np.ndarray, "N 2"]) -> Float[np.ndarray, " N"]:
