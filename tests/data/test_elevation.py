@@ -20,7 +20,9 @@ from scenefactory_jax.roadgraph import elevation
 from scenefactory_jax.roadgraph.elevation import Ground
 
 LINE = np.linspace(-90.0, 90.0, 181)
-SLOPE, BRIDGE_M = np.array([0.06, -0.02]), 6.0
+SLOPE = np.array([0.06, -0.02])
+BRIDGE_M, AT_M = 6.0, 5.0  # height of the bridge in the middle, place of the car on it
+HIGH_M = BRIDGE_M * np.exp(-((AT_M / 40.0) ** 2))
 
 
 def lane(id, start, direction, height, *, kind=2):
@@ -44,11 +46,11 @@ def pack(raw, *changes):
 
 @pytest.fixture(scope="module")
 def crossing():
-    """A street along x, a bridge over it along y, and a car on each of them, 1 m beside the other's line."""
+    """A street along x, a bridge over it along y, and a car on each of them, the lower one under the bridge."""
     plain, bridge = lambda xy: 0 * xy[:, 0], lambda xy: BRIDGE_M * np.exp(-((xy[:, 1] / 40.0) ** 2))
     roads = [lane(1, (0, y), (1, 0), plain) for y in (-2.0, 2.0)] + [lane(2, (x, 0), (0, 1), bridge) for x in (-2.0, 2.0)]
     roads += [lane(3, (0, 5), (1, 0), plain, kind=15), lane(4, (5, 0), (0, 1), bridge, kind=15)]
-    return scene_with(*roads, tracks=[driver(1, (-1.0, 2.0), 0.0, 0.0), driver(2, (2.0, 1.0), np.pi / 2, BRIDGE_M)])
+    return scene_with(*roads, tracks=[driver(1, (-1.0, 2.0), 0.0, 0.0), driver(2, (2.0, AT_M), np.pi / 2, HIGH_M)])
 
 
 def test_a_plane_is_exact_where_the_map_is_and_beyond():
@@ -72,11 +74,11 @@ def test_levels_are_told_apart_by_height_and_by_the_lanes_direction(crossing):
         np.testing.assert_allclose(elevation.find_ground(scene.elevation, points[:, :2], points[:, 2]).height, points[:, 2], atol=0.05)
     start = elevation.find_start_ground(scene)
     assert start is not None
-    np.testing.assert_allclose(start.height[:2], [0.0, BRIDGE_M], atol=0.15)
+    np.testing.assert_allclose(start.height[:2], [0.0, HIGH_M], atol=0.1)
     zero = jnp.zeros(2)
     boxes = Boxes(scene.agents.position[:2], zero + 0.7, scene.agents.yaw[:2], jnp.zeros((2, 2)), zero, jnp.ones((2, 2)), zero, zero == 0)
     lifted = elevation.lift_boxes(scene, boxes).elevation
-    np.testing.assert_allclose(lifted, [0.7, BRIDGE_M + 0.7], atol=0.15)
+    np.testing.assert_allclose(lifted, [0.7, HIGH_M + 0.7], atol=0.1)
     motion = bicycle.read(bicycle.init(None, scene), height=0.7)
     np.testing.assert_allclose(motion.position[:2, 2], lifted, atol=1e-4)
     edges = elevation.select_level(scene, motion).edges.valid[:2]
