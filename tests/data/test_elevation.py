@@ -2,22 +2,25 @@
 
 from dataclasses import replace
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
 from scenefactory_jax.cli.hydra_config import load_config
 from scenefactory_jax.core.instantiate import ConfigError
-from scenefactory_jax.core.pytree import to_jax
+from scenefactory_jax.core.pytree import to_jax, unchecked
 from scenefactory_jax.core.raw_scene import Polyline, RawScene, Track, Unpackable
-from scenefactory_jax.core.types import DRIVABLE, Boxes
+from scenefactory_jax.core.types import DRIVABLE, Boxes, State
 from scenefactory_jax.data.loading import scene_source
 from scenefactory_jax.data.packing import elevation_grid
 from scenefactory_jax.data.packing.stack import stack
 from scenefactory_jax.dynamics import bicycle
 from scenefactory_jax.dynamics.articulated.parameters import GRAVITY
+from scenefactory_jax.env.observations import state_vectors
 from scenefactory_jax.roadgraph import elevation
 from scenefactory_jax.roadgraph.elevation import Ground
+from scenefactory_jax.visualization.mujoco import exported_world
 
 LINE = np.linspace(-90.0, 90.0, 181)
 SLOPE = np.array([0.06, -0.02])
@@ -63,6 +66,12 @@ def test_a_plane_is_exact_where_the_map_is_and_beyond():
     sine, cosine = elevation.compute_grade(ground, jnp.full(4, np.pi))
     np.testing.assert_allclose(sine / cosine, -SLOPE[0], atol=1e-4)
     assert scene.road.height is None
+    motion = bicycle.read(bicycle.init(jax.random.key(0), scene), height=0.7)
+    state = unchecked(State, motion=motion, agents=scene.agents)
+    grades = state_vectors.grade_ahead(scene, state, ahead_m=[10.0, 20.0], grade_scale=0.1)
+    np.testing.assert_allclose(grades[0], [0.6, 0.6, 0.6, -0.2], atol=1e-3)
+    with pytest.raises(ConfigError, match=r"^scenes\.pack\.elevation: an exported world is flat; expected null"):
+        exported_world.sample_start({}, scene, seed=0)
 
 
 def test_levels_are_told_apart_by_height_and_by_the_lanes_direction(crossing):
@@ -79,7 +88,7 @@ def test_levels_are_told_apart_by_height_and_by_the_lanes_direction(crossing):
     boxes = Boxes(scene.agents.position[:2], zero + 0.7, scene.agents.yaw[:2], jnp.zeros((2, 2)), zero, jnp.ones((2, 2)), zero, zero == 0)
     lifted = elevation.lift_boxes(scene, boxes).elevation
     np.testing.assert_allclose(lifted, [0.7, HIGH_M + 0.7], atol=0.1)
-    motion = bicycle.read(bicycle.init(None, scene), height=0.7)
+    motion = bicycle.read(bicycle.init(jax.random.key(0), scene), height=0.7)
     np.testing.assert_allclose(motion.position[:2, 2], lifted, atol=1e-4)
     edges = elevation.select_level(scene, motion).edges.valid[:2]
     near = np.linalg.norm(np.asarray(scene.edges.midpoint) - np.asarray(scene.agents.position[0]), axis=1) < 10.0

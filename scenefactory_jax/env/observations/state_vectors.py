@@ -5,11 +5,12 @@ from collections.abc import Callable
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from scenefactory_jax.core.geometry import heading_vector, safe_norm, to_frame
+from scenefactory_jax.core.geometry import dot, heading_vector, safe_norm, to_frame
 from scenefactory_jax.core.schema import ConfigError, NonNegative, Positive
 from scenefactory_jax.core.types import SURFACES, Scene, State
 from scenefactory_jax.env import route_following
 from scenefactory_jax.env.observations.column_bounds import ANY, FRACTION, LENGTH, SIGNED, bound_observation
+from scenefactory_jax.roadgraph.elevation import find_ground
 from scenefactory_jax.weather.patches import read_condition
 
 
@@ -56,16 +57,40 @@ def friction_ahead(
     Args:
         friction: `weather.friction` of the config, bound; the environment supplies it.
     """
+    points, _ = _find_points_ahead(scene, state, ahead_m)
+    speed = jnp.broadcast_to(safe_norm(state.motion.velocity[:, :2])[:, None], points.shape[:2])
+    return friction(state.weather, points, speed)
+
+
+def grade_ahead(scene: Scene, state: State, *, ahead_m: list[NonNegative], grade_scale: Positive) -> Float[Array, "A F"]:
+    """Rise over run of the road along the agent's way: under the car's centre, then at each of `ahead_m`, as in `friction_ahead`.
+
+    The last column is the bank: the rise to the left of the car. All are zero on a flat road.
+
+    Args:
+        grade_scale: the grade that reads 1.
+    """
+    points, yaw = _find_points_ahead(scene, state, ahead_m)
+    if scene.elevation is None:
+        return jnp.zeros((len(points), points.shape[1] + 1), jnp.float32)
+    ground = find_ground(scene.elevation, points, jnp.broadcast_to(state.motion.position[:, 2:], points.shape[:2]))
+    bank = dot(ground.slope[:, 0], heading_vector(state.motion.yaw + 0.5 * jnp.pi))
+    return jnp.concatenate([dot(ground.slope, heading_vector(yaw)), bank[:, None]], axis=1) / grade_scale
+
+
+def _find_points_ahead(scene: Scene, state: State, ahead_m: list[float]) -> tuple[Float[Array, "A N 2"], Float[Array, "A N"]]:
+    """Computes the places under each car and ahead of it, and the directions of the way there."""
     agents, motion = state.agents, state.motion
     here, ahead = motion.position[:, None, :2], jnp.array(ahead_m, jnp.float32)
     points = here + ahead[:, None] * heading_vector(motion.yaw)[:, None]
+    yaw = jnp.broadcast_to(motion.yaw[:, None], (len(motion.yaw), len(ahead_m) + 1))
     if scene.routes.length.shape[0]:
         row = jnp.broadcast_to(agents.route[:, None], points.shape[:2])
-        along, _ = route_following.find_point(scene, row, state.route.arc[:, None] + ahead)
-        points = jnp.where(route_following.find_routed(scene, agents)[:, None, None], along, points)
-    points = jnp.concatenate([here, points], axis=1)
-    speed = jnp.broadcast_to(safe_norm(motion.velocity[:, :2])[:, None], points.shape[:2])
-    return friction(state.weather, points, speed)
+        along, direction = route_following.find_point(scene, row, state.route.arc[:, None] + ahead)
+        routed = route_following.find_routed(scene, agents)[:, None]
+        points = jnp.where(routed[..., None], along, points)
+        yaw = yaw.at[:, 1:].set(jnp.where(routed, jnp.arctan2(direction[..., 1], direction[..., 0]), yaw[:, 1:]))
+    return jnp.concatenate([here, points], axis=1), yaw
 
 
 def yaw_rate_and_steer(scene: Scene, state: State, *, turn_scale_radps: Positive, steer_scale_rad: Positive) -> Float[Array, "A 2"]:
