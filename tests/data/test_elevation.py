@@ -60,15 +60,19 @@ def test_a_plane_is_exact_where_the_map_is_and_beyond():
     roads = [lane(i, (0, y), (1, 0), lambda xy: xy @ SLOPE + 300.0) for i, y in enumerate((-3.5, 0.0, 3.5))]
     scene = pack(scene_with(*roads, tracks=[driver(1, (0, 0), 0.0, 300.0)]))
     places = jnp.array([[0.0, 0.0], [37.1, -2.2], [-80.3, 60.0], [150.0, -120.0]])
-    ground = elevation.find_ground(scene.elevation, places, 0.0)
+
+    @jax.jit  # by itself, each of its operations would be compiled
+    def look(scene, places):
+        ground = elevation.find_ground(scene.elevation, places, 0.0)
+        state = unchecked(State, motion=bicycle.read(bicycle.init(jax.random.key(0), scene), height=0.7), agents=scene.agents)
+        grades = state_vectors.grade_ahead(scene, state, ahead_m=[10.0, 20.0], grade_scale=0.1)
+        return ground, elevation.compute_grade(ground, jnp.full(4, jnp.pi)), grades
+
+    ground, (sine, cosine), grades = look(scene, places)
     np.testing.assert_allclose(ground.height, places @ SLOPE, atol=2e-3)
     np.testing.assert_allclose(ground.slope, np.tile(SLOPE, (4, 1)), atol=1e-4)
-    sine, cosine = elevation.compute_grade(ground, jnp.full(4, np.pi))
     np.testing.assert_allclose(sine / cosine, -SLOPE[0], atol=1e-4)
     assert scene.road.height is None
-    motion = bicycle.read(bicycle.init(jax.random.key(0), scene), height=0.7)
-    state = unchecked(State, motion=motion, agents=scene.agents)
-    grades = state_vectors.grade_ahead(scene, state, ahead_m=[10.0, 20.0], grade_scale=0.1)
     np.testing.assert_allclose(grades[0], [0.6, 0.6, 0.6, -0.2], atol=1e-3)
     with pytest.raises(ConfigError, match=r"^scenes\.pack\.elevation: an exported world is flat; expected null"):
         exported_world.sample_start({}, scene, seed=0)
@@ -78,19 +82,21 @@ def test_levels_are_told_apart_by_height_and_by_the_lanes_direction(crossing):
     with pytest.raises(Unpackable, match=r"roads: 2 levels at one place; scenes\.pack\.elevation\.levels is 1"):
         pack(crossing)
     scene = pack(crossing, "scenes.pack.elevation.levels=2")
+    find = jax.jit(elevation.find_ground)
     for road in crossing.roads:
         points = jnp.asarray(road.xyz - [-1.0, 2.0, 0.0], jnp.float32)  # around the first car
-        np.testing.assert_allclose(elevation.find_ground(scene.elevation, points[:, :2], points[:, 2]).height, points[:, 2], atol=0.05)
-    start = elevation.find_start_ground(scene)
-    assert start is not None
-    np.testing.assert_allclose(start.height[:2], [0.0, HIGH_M], atol=0.1)
-    zero = jnp.zeros(2)
-    boxes = Boxes(scene.agents.position[:2], zero + 0.7, scene.agents.yaw[:2], jnp.zeros((2, 2)), zero, jnp.ones((2, 2)), zero, zero == 0)
-    lifted = elevation.lift_boxes(scene, boxes).elevation
+        np.testing.assert_allclose(find(scene.elevation, points[:, :2], points[:, 2]).height, points[:, 2], atol=0.05)
+
+    @jax.jit
+    def look(scene):
+        zero, agents = jnp.zeros(2), scene.agents
+        boxes = Boxes(agents.position[:2], zero + 0.7, agents.yaw[:2], jnp.zeros((2, 2)), zero, jnp.ones((2, 2)), zero, zero == 0)
+        motion = bicycle.read(bicycle.init(jax.random.key(0), scene), height=0.7)
+        return elevation.lift_boxes(scene, boxes).elevation, motion, elevation.select_level(scene, motion).edges.valid[:2]
+
+    lifted, motion, edges = look(scene)
     np.testing.assert_allclose(lifted, [0.7, HIGH_M + 0.7], atol=0.1)
-    motion = bicycle.read(bicycle.init(jax.random.key(0), scene), height=0.7)
     np.testing.assert_allclose(motion.position[:2, 2], lifted, atol=1e-4)
-    edges = elevation.select_level(scene, motion).edges.valid[:2]
     near = np.linalg.norm(np.asarray(scene.edges.midpoint) - np.asarray(scene.agents.position[0]), axis=1) < 10.0
     along = np.abs(np.asarray(scene.edges.direction)[:, 0]) > 0.5
     assert edges[0, near & along].all() and not edges[0, near & ~along].any()
@@ -112,10 +118,10 @@ def test_a_bicycle_feels_the_grade_along_its_heading():
     zero, yaw = jnp.zeros(4), jnp.array([0.0, np.pi / 2, np.pi, 0.0])
     ground = Ground(zero, jnp.tile(jnp.array([0.1, 0.0]), (4, 1)))
     body = bicycle.Body(jnp.zeros((4, 2)), yaw, jnp.array([10.0, 10.0, 10.0, 0.0]), *[zero] * 6, ground=ground)
-    after = bicycle.integrate_bicycle(body, jnp.zeros((4, 3)), limits, dt=0.1)
+    drive = jax.jit(lambda body: (bicycle.integrate_bicycle(body, jnp.zeros((4, 3)), limits, dt=0.1), bicycle.read(body, height=0.7)))
+    after, motion = drive(body)
     sine = 0.1 / np.hypot(1.0, 0.1)
     np.testing.assert_allclose((after.speed - body.speed) / 0.1, [-0.1 - GRAVITY * sine, -0.1, -0.1 + GRAVITY * sine, 0.0], rtol=1e-3)
-    motion = bicycle.read(body, height=0.7)
     np.testing.assert_allclose(np.linalg.norm(motion.velocity, axis=1), body.speed, rtol=1e-5)
     np.testing.assert_allclose(motion.velocity[:, 2], [10 * sine, 0.0, -10 * sine, 0.0], atol=1e-5)
 
