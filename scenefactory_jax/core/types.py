@@ -351,6 +351,7 @@ class Traffic(NamedTuple):
     advance: Callable[[Scene, Any, Boxes, Int[Array, ""]], Any]  # (scene, state, active agents, control step) -> state one step later
     read: Callable[[Scene, Any, Int[Array, ""]], Boxes]  # (scene, state, control step) -> its boxes
     past: PastPolicies | None = None
+    on_road: bool = False  # elevations are heights of the world; False: above a flat road, and the environment adds the road's
 
 
 class Env(NamedTuple):

@@ -9,15 +9,15 @@ Height and slope are continuous, and a plane is exact. Beyond the grid the heigh
 levels, there is one height a level; everywhere else the levels are equal.
 """
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
 from scenefactory_jax.core.geometry import cross, dot, heading_vector
 from scenefactory_jax.core.pytree import replace, unchecked
-from scenefactory_jax.core.types import Boxes, Elevation, Motion, Road, Scene
+from scenefactory_jax.core.types import Boxes, Elevation, Motion, Road, Scene, Traffic
 
 LEVEL_M = 2.5  # what is higher or lower by more is on another level: a car is lower, a bridge is higher
 TURN_M = 10.0  # see `find_ground_by_lane`
@@ -107,6 +107,12 @@ def lift_boxes(scene: Scene, boxes: Boxes) -> Boxes:
     """Places boxes whose elevations are above a flat road on the road of the scene."""
     ground = find_ground_by_lane(scene, boxes.position, boxes.yaw)
     return boxes if ground is None else replace(boxes, elevation=boxes.elevation + ground.height)
+
+
+def read_traffic(traffic: Traffic, scene: Scene, state: Any, step: Int[Array, ""]) -> Boxes:
+    """Computes the boxes of background traffic on the road of the scene."""
+    boxes = traffic.read(scene, state, step)
+    return boxes if traffic.on_road else lift_boxes(scene, boxes)
 
 
 def measure_heights(scene: Scene, motion: Motion) -> Float[Array, " A"]:

@@ -70,27 +70,31 @@ def grade_ahead(scene: Scene, state: State, *, ahead_m: list[NonNegative], grade
     Args:
         grade_scale: the grade that reads 1.
     """
-    points, yaw = _find_points_ahead(scene, state, ahead_m)
+    points, direction = _find_points_ahead(scene, state, ahead_m)
     if scene.elevation is None:
         return jnp.zeros((len(points), points.shape[1] + 1), jnp.float32)
-    ground = find_ground(scene.elevation, points, jnp.broadcast_to(state.motion.position[:, 2:], points.shape[:2]))
-    bank = dot(ground.slope[:, 0], heading_vector(state.motion.yaw + 0.5 * jnp.pi))
-    return jnp.concatenate([dot(ground.slope, heading_vector(yaw)), bank[:, None]], axis=1) / grade_scale
+    yaw = state.motion.yaw
+    slope = find_ground(scene.elevation, points, jnp.broadcast_to(state.motion.position[:, 2:], points.shape[:2])).slope
+    heading = heading_vector(yaw)[:, None]
+    if direction is not None:
+        direction = jnp.where(route_following.find_routed(scene, state.agents)[:, None, None], direction, heading)
+    ahead = dot(slope[:, 1:], heading if direction is None else direction)
+    here = [dot(slope[:, 0], heading_vector(yaw + turn))[:, None] for turn in (0.0, 0.5 * jnp.pi)]
+    return jnp.concatenate([here[0], ahead, here[1]], axis=1) / grade_scale
 
 
-def _find_points_ahead(scene: Scene, state: State, ahead_m: list[float]) -> tuple[Float[Array, "A N 2"], Float[Array, "A N"]]:
-    """Computes the places under each car and ahead of it, and the directions of the way there."""
-    agents, motion = state.agents, state.motion
+def _find_points_ahead(
+    scene: Scene, state: State, ahead_m: list[NonNegative]
+) -> tuple[Float[Array, "A M 2"], Float[Array, "A N 2"] | None]:
+    """Computes the places under each car and ahead of it, and the directions of its route there; None without routes."""
+    agents, motion, direction = state.agents, state.motion, None
     here, ahead = motion.position[:, None, :2], jnp.array(ahead_m, jnp.float32)
     points = here + ahead[:, None] * heading_vector(motion.yaw)[:, None]
-    yaw = jnp.broadcast_to(motion.yaw[:, None], (len(motion.yaw), len(ahead_m) + 1))
     if scene.routes.length.shape[0]:
         row = jnp.broadcast_to(agents.route[:, None], points.shape[:2])
         along, direction = route_following.find_point(scene, row, state.route.arc[:, None] + ahead)
-        routed = route_following.find_routed(scene, agents)[:, None]
-        points = jnp.where(routed[..., None], along, points)
-        yaw = yaw.at[:, 1:].set(jnp.where(routed, jnp.arctan2(direction[..., 1], direction[..., 0]), yaw[:, 1:]))
-    return jnp.concatenate([here, points], axis=1), yaw
+        points = jnp.where(route_following.find_routed(scene, agents)[:, None, None], along, points)
+    return jnp.concatenate([here, points], axis=1), direction
 
 
 def yaw_rate_and_steer(scene: Scene, state: State, *, turn_scale_radps: Positive, steer_scale_rad: Positive) -> Float[Array, "A 2"]:
