@@ -30,11 +30,8 @@ class Ground(NamedTuple):
     slope: Float[Array, "*n 2"]  # rise over run along x and y
 
 
-def find_ground(elevation: Elevation, position: Float[Array, "*n 2"], near: float | Float[Array, "*n"]) -> Ground:
+def find_ground(elevation: Elevation, position: Float[Array, "*n 2"], near: Float[Array, "*n"]) -> Ground:
     """Computes the road at places, of the level whose height is nearest to `near`, m."""
-    near = jnp.broadcast_to(near, position.shape[:-1])
-    if position.ndim == 1:
-        return _find_ground(elevation, position, near)
     find = jax.vmap(lambda place, height: _find_ground(elevation, place, height))
     flat = find(position.reshape(-1, 2), near.reshape(-1))
     return Ground(flat.height.reshape(near.shape), flat.slope.reshape(position.shape))

@@ -12,6 +12,7 @@ from scenefactory_jax.core.instantiate import ConfigError
 from scenefactory_jax.core.pytree import to_jax, unchecked
 from scenefactory_jax.core.raw_scene import Polyline, RawScene, Track, Unpackable
 from scenefactory_jax.core.types import DRIVABLE, Boxes, State
+from scenefactory_jax.data.formats import reader_selection
 from scenefactory_jax.data.loading import scene_source
 from scenefactory_jax.data.packing import elevation_grid
 from scenefactory_jax.data.packing.stack import stack
@@ -25,6 +26,7 @@ from scenefactory_jax.visualization.mujoco import exported_world
 LINE = np.linspace(-90.0, 90.0, 181)
 SLOPE = np.array([0.06, -0.02])
 BRIDGE_M, AT_M = 6.0, 5.0  # height of the bridge in the middle, place of the car on it
+FIND = jax.jit(elevation.find_ground)
 HIGH_M = BRIDGE_M * np.exp(-((AT_M / 40.0) ** 2))
 
 
@@ -63,7 +65,7 @@ def test_a_plane_is_exact_where_the_map_is_and_beyond():
 
     @jax.jit  # by itself, each of its operations would be compiled
     def look(scene, places):
-        ground = elevation.find_ground(scene.elevation, places, 0.0)
+        ground = elevation.find_ground(scene.elevation, places, jnp.zeros(4))
         state = unchecked(State, motion=bicycle.read(bicycle.init(jax.random.key(0), scene), height=0.7), agents=scene.agents)
         grades = state_vectors.grade_ahead(scene, state, ahead_m=[10.0, 20.0], grade_scale=0.1)
         return ground, elevation.compute_grade(ground, jnp.full(4, jnp.pi)), grades
@@ -82,10 +84,9 @@ def test_levels_are_told_apart_by_height_and_by_the_lanes_direction(crossing):
     with pytest.raises(Unpackable, match=r"roads: 2 levels at one place; scenes\.pack\.elevation\.levels is 1"):
         pack(crossing)
     scene = pack(crossing, "scenes.pack.elevation.levels=2")
-    find = jax.jit(elevation.find_ground)
     for road in crossing.roads:
         points = jnp.asarray(road.xyz - [-1.0, 2.0, 0.0], jnp.float32)  # around the first car
-        np.testing.assert_allclose(find(scene.elevation, points[:, :2], points[:, 2]).height, points[:, 2], atol=0.05)
+        np.testing.assert_allclose(FIND(scene.elevation, points[:, :2], points[:, 2]).height, points[:, 2], atol=0.05)
 
     @jax.jit
     def look(scene):
@@ -144,3 +145,19 @@ def test_a_town_on_hills_is_the_town_with_heights():
         nearest = lanes[np.argmin(np.linalg.norm(lanes[:, :2] - place[:2], axis=1))]
         apart = np.linalg.norm(nearest[:2] - place[:2])
         assert abs(place[2] - track.size[2] / 2 - nearest[2]) <= 0.2 * apart + 1e-3
+
+
+def test_heights_of_opendrive_and_womd_are_those_of_their_lanes(shared_data):
+    config = load_config("train", "scenes=womd", "scenes/pack/elevation=hills")["scenes"]
+    numbers = elevation_grid.ElevationConfig(**config["pack"]["elevation"])
+    formats = config["formats"] | {"opendrive": config["formats"]["opendrive"] | {"traffic": None}}
+    womd = min((shared_data / "womd" / "train").iterdir())
+    for path, error_m, grade in ((shared_data / "formats" / "opendrive" / "crest-curve.xodr", 0.01, 0.13), (womd, 0.1, 0.01)):
+        raw = next(iter(reader_selection.read(path, reader_selection.make(formats))))
+        origin = np.concatenate([line.xyz for line in raw.roads if line.kind in DRIVABLE]).mean(axis=0)
+        fit = to_jax(elevation_grid.fit_elevation(raw, origin, 100.0, numbers))
+        points = np.concatenate([line.xyz for line in raw.roads if line.kind in DRIVABLE]) - origin
+        points = points[(np.abs(points[:, :2]) <= 100.0).all(axis=1)][::5][:1000]
+        ground = FIND(fit, jnp.asarray(np.resize(points[:, :2], (1000, 2)), jnp.float32), jnp.zeros(1000))
+        assert np.abs(ground.height - np.resize(points[:, 2], 1000)).max() < error_m, path
+        assert np.linalg.norm(ground.slope, axis=1).max() > grade, path
