@@ -38,13 +38,17 @@ def cone():
 
 
 def worlds(surfaces, *, speed, position=(0.0, 0.0), yaw=0.0):
+    """Worlds of one car on these surfaces; each has the same surface again 6 m below, which the car never meets."""
     count = len(surfaces)
     full = lambda value: np.broadcast_to(value, (count, 1))  # noqa: E731
     scene = open_ground.make_open_ground(
         np.broadcast_to(position, (count, 1, 2)), full(yaw), np.reshape(np.broadcast_to(speed, count), (count, 1)), np.full(count, 0.8),
         np.zeros(count, np.int32), size=(CAR.length, CAR.width),
     )  # fmt: skip
-    lift = lambda world, height: replace(world, elevation=Elevation(height[None], jnp.full(2, AXIS[0]), jnp.float32(4.0)))  # noqa: E731
+
+    def lift(world, height):
+        return replace(world, elevation=Elevation(jnp.stack([height - 6.0, height]), jnp.full(2, AXIS[0]), jnp.float32(4.0)))
+
     return jax.vmap(lift)(scene, jnp.asarray(np.stack(surfaces), jnp.float32))
 
 
