@@ -14,7 +14,7 @@ from scenefactory_jax.core.raw_scene import Polyline, RawScene, Track, Unpackabl
 from scenefactory_jax.core.types import DRIVABLE, Boxes, State
 from scenefactory_jax.data.formats import reader_selection
 from scenefactory_jax.data.loading import scene_source
-from scenefactory_jax.data.packing import elevation_grid
+from scenefactory_jax.data.packing import elevation_grid, route_conflicts
 from scenefactory_jax.data.packing.stack import stack
 from scenefactory_jax.dynamics import bicycle
 from scenefactory_jax.dynamics.articulated.parameters import GRAVITY
@@ -102,6 +102,20 @@ def test_levels_are_told_apart_by_height_and_by_the_lanes_direction(crossing):
     along = np.abs(np.asarray(scene.edges.direction)[:, 0]) > 0.5
     assert edges[0, near & along].all() and not edges[0, near & ~along].any()
     assert edges[1, near & ~along].all() and not edges[1, near & along].any()
+
+
+def test_routes_on_two_levels_do_not_meet():
+    """A route along x and one along y over it, or on the same ground."""
+    way = np.arange(-20.0, 21.0)
+    lines = np.stack([np.column_stack([way, 0 * way]), np.column_stack([0 * way, way])])
+    leaves = {
+        "traffic_log.has_route": np.ones(2, bool), "traffic_log.route": np.arange(2), "traffic_log.size": np.full((2, 2), 2.0),
+        "routes.position": lines, "routes.length": np.full(2, 40.0), "routes.lane": np.tile([[7], [8]], (1, 41)),
+        "road.midpoint": lines.reshape(-1, 2), "road.polyline": np.repeat([7, 8], 41),
+    }  # fmt: skip
+    for height, meet in ((BRIDGE_M, False), (0.0, True)):
+        zones = route_conflicts.find_zones(leaves | {"road.height": np.repeat([0.0, height], 41)})
+        assert np.isfinite(zones["traffic_log.zone_enter"]).any() == meet
 
 
 def test_stacked_scenes_have_heights_of_one_size_or_none(crossing):

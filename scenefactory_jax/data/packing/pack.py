@@ -128,7 +128,7 @@ def pack(
     leaves["log.dt"] = np.median(np.diff(raw.times)) if len(raw.times) > 1 else np.ones(())
     beside, others, traffic_dropped = _traffic(raw, logs, chosen, leaves, half, first, traffic, min_traffic_size_m)
     stops = control_columns.pack_controls(raw, origin, half, controls)
-    who = {"agents": chosen, "slots": agents, "traffic": others, "size": beside["traffic_log.size"]}
+    who = {"agents": chosen, "slots": agents, "traffic": others, "size": beside["traffic_log.size"], "road": road}
     added, counts = _routes(raw, logs, origin, half, **who, controls=stops.columns, config=routes)
     leaves |= beside | stops.columns | added
     if starts is not None:
@@ -182,13 +182,14 @@ def _describe_source(
 
 
 def _routes(
-    raw: RawScene, logs: Logs, *place: Any, slots: int, traffic: list[int], size: np.ndarray, config: RouteConfig | None, **who: Any
-) -> tuple[dict[str, np.ndarray], RouteCounts | None]:
+    raw: RawScene, logs: Logs, *place: Any, slots: int, traffic: list[int], size: np.ndarray, road: dict[str, np.ndarray],
+    config: RouteConfig | None, **who: Any,
+) -> tuple[dict[str, np.ndarray], RouteCounts | None]:  # fmt: skip
     """Columns of the routes and their counts; without a config there are none."""
     if config is None:
         return route_columns.make_no_routes(slots, len(traffic)) | route_conflicts.make_no_zones(len(traffic)), None
     found, counts = route_columns.pack_routes(raw, logs, *place, slots=slots, traffic=traffic, config=config, **who)
-    return found | route_conflicts.find_zones(found | {"traffic_log.size": size}), counts
+    return found | route_conflicts.find_zones(road | found | {"traffic_log.size": size}), counts
 
 
 def _find_centre(raw: RawScene, centre: str) -> tuple[Float[np.ndarray, "3"], str]:
