@@ -51,6 +51,7 @@ class Road:
     polyline: Int[Array, " P"]  # index into RawScene.roads
     arc: Float[Array, " P"]  # arc length along the polyline at the midpoint
     valid: Bool[Array, " P"]
+    height: Float[Array, " P"] | None = None  # of the midpoint; None: the scene has one level
 
 
 @pytree_dataclass
@@ -165,6 +166,15 @@ class SpatialGrid:
 
 
 @pytree_dataclass
+class Elevation:
+    """Heights of the road as quadratic B-splines over a square grid, on one or more levels; see `roadgraph.elevation`."""
+
+    height: Float[Array, "V Y X"]  # coefficients, level after level, m
+    origin: Float[Array, "2"]  # place of the first coefficient
+    cell_m: Float[Array, ""]  # between coefficients
+
+
+@pytree_dataclass
 class Scene:
     """The data of one world: constant in an episode, except for agents and weather, which a reset may sample again, and the traffic boxes.
 
@@ -183,6 +193,7 @@ class Scene:
     routes: Routes = dataclasses.field(default_factory=lambda: make_empty_rows(Routes))
     controls: TrafficControls = dataclasses.field(default_factory=lambda: make_empty_rows(TrafficControls))
     road_grid: SpatialGrid | None = None  # of `road`, for queries within a radius; None: they read all of it
+    elevation: Elevation | None = None  # None: the road is flat, at height 0
 
 
 @pytree_dataclass
@@ -340,6 +351,7 @@ class Traffic(NamedTuple):
     advance: Callable[[Scene, Any, Boxes, Int[Array, ""]], Any]  # (scene, state, active agents, control step) -> state one step later
     read: Callable[[Scene, Any, Int[Array, ""]], Boxes]  # (scene, state, control step) -> its boxes
     past: PastPolicies | None = None
+    on_road: bool = False  # elevations are heights of the world; False: above a flat road, and the environment adds the road's
 
 
 class Env(NamedTuple):

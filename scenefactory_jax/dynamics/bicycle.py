@@ -1,6 +1,7 @@
 """Kinematic bicycle model: one integration per control step, no forces, no tyres.
 
-Wheelbase, steering limit and longitudinal accelerations are those of the articulated car. Contact forces are computed by the same model as
+Wheelbase, steering limit and longitudinal accelerations are those of the articulated car. On a road with heights, the speed is that along
+the road, and gravity acts along it; a car that stands on a grade does not roll back. Contact forces are computed by the same model as
 between articulated cars; they are reported and do not move the cars.
 """
 
@@ -18,6 +19,7 @@ from scenefactory_jax.core.schema import Bounds, NonNegative, Positive
 from scenefactory_jax.core.types import Dynamics, Motion, Scene
 from scenefactory_jax.dynamics.articulated.parameters import GRAVITY
 from scenefactory_jax.dynamics.collision import REPORT_S, collect_boxes, make_contact, report_forces
+from scenefactory_jax.roadgraph.elevation import LEVEL_M, Ground, compute_grade, find_ground, find_start_ground, lift_motion
 
 
 @pytree_dataclass
@@ -33,6 +35,7 @@ class Body:
     contact_force: Float[Array, " A"]
     mu: Float[Array, " A"]
     friction_utilization: Float[Array, " A"]
+    ground: Ground | None = None  # the road under the box's centre; None: it is flat
 
 
 def make(
@@ -75,11 +78,13 @@ def make(
     Raises:
         ConfigError: a number out of range, or an unknown, missing or wrong value of `contact`, by name.
     """
-    collision = make_contact(contact, height=math.inf, step_s=REPORT_S)
+    collision = make_contact(contact, height=LEVEL_M, step_s=REPORT_S)
     limits = Limits(wheelbase, rear_length, steering_limit, acceleration, deceleration, rolling, drag, air_drag, speed_limit)
 
     def advance(scene: Scene, body: Body, action: Float[Array, "A 3"], active: Bool[Array, " A"]) -> Body:
         moved = integrate_bicycle(body, jnp.clip(action, -1.0, 1.0), limits, dt=control_dt)
+        if scene.elevation is not None and body.ground is not None:
+            moved = replace(moved, ground=find_ground(scene.elevation, moved.position, body.ground.height))
         mu = friction(scene.weather, body.position, body.speed)
         cars = collect_boxes(read(moved, height=centre_height), scene.agents.size, active, mass)
         force = report_forces(collision, cars, scene.traffic, control_dt)
@@ -140,7 +145,7 @@ def init(key: PRNGKeyArray, scene: Scene) -> Body:
     """Places cars at their starts."""
     agents = scene.agents
     zeros = (jnp.zeros(agents.yaw.shape, jnp.float32) for _ in range(6))  # separate arrays: none may be donated twice
-    return Body(agents.position, agents.yaw, agents.speed, *zeros)
+    return Body(agents.position, agents.yaw, agents.speed, *zeros, ground=find_start_ground(scene))
 
 
 def integrate_bicycle(body: Body, action: Float[Array, "A 3"], limits: Limits, *, dt: float) -> Body:
@@ -148,15 +153,18 @@ def integrate_bicycle(body: Body, action: Float[Array, "A 3"], limits: Limits, *
     throttle, brake = jnp.maximum(action[:, 0], 0.0), jnp.maximum(action[:, 2], 0.0)
     push = limits.acceleration * throttle - limits.deceleration * brake
     push = push - limits.rolling - (limits.drag + limits.air_drag * body.speed) * body.speed
+    sine, cosine = (None, None) if body.ground is None else compute_grade(body.ground, body.yaw)
+    push = push if sine is None else push - GRAVITY * sine
     speed = jnp.clip(body.speed + push * dt, 0.0, limits.speed)
     mean = 0.5 * (body.speed + speed)
     steer = limits.steering * action[:, 1]
     slip_angle = jnp.arctan(limits.rear_length / limits.wheelbase * jnp.tan(steer))
     yaw_rate = mean * jnp.cos(slip_angle) * jnp.tan(steer) / limits.wheelbase
     chord = heading_vector(body.yaw + slip_angle + 0.5 * yaw_rate * dt)  # the chord of an arc points along the heading at half the arc
+    way = mean * dt if cosine is None else mean * dt * cosine
     return replace(
         body,
-        position=body.position + (mean * dt)[:, None] * chord,
+        position=body.position + way[:, None] * chord,
         yaw=wrap_angle(body.yaw + yaw_rate * dt),
         speed=speed,
         steer=steer,
@@ -168,8 +176,10 @@ def integrate_bicycle(body: Body, action: Float[Array, "A 3"], limits: Limits, *
 def read(body: Body, *, height: float) -> Motion:
     """Reads the motion of the cars."""
     flat = body.speed[:, None] * heading_vector(body.yaw + body.slip_angle)
+    if body.ground is not None:
+        flat = flat * compute_grade(body.ground, body.yaw)[1][:, None]
     zero = jnp.zeros_like(body.speed)
-    return Motion(
+    motion = Motion(
         position=jnp.concatenate([body.position, jnp.full_like(zero, height)[:, None]], axis=-1),
         velocity=jnp.concatenate([flat, zero[:, None]], axis=-1),
         yaw=body.yaw,
@@ -181,3 +191,4 @@ def read(body: Body, *, height: float) -> Motion:
         friction_utilization=body.friction_utilization,
         slip=zero,
     )
+    return lift_motion(motion, body.ground)

@@ -1,11 +1,11 @@
 """Waymax's invertible bicycle: acceleration and curvature in place of pedals and a steering angle, and its inverse.
 
 Formulas: Waymax (arXiv:2310.08710). The speed is the length of the velocity, so a car that brakes below zero moves backwards in
-that step and forwards in the next. Contact forces are computed as between articulated cars; they are reported and do not move the cars.
+that step and forwards in the next. On a road with heights, motion and velocity are those seen from above. Contact forces are computed as
+between articulated cars; they are reported and do not move the cars.
 """
 
 import functools
-import math
 from collections.abc import Callable
 from typing import Any
 
@@ -18,6 +18,7 @@ from scenefactory_jax.core.schema import NonNegative, Positive
 from scenefactory_jax.core.types import Dynamics, Motion, Scene
 from scenefactory_jax.dynamics.articulated.parameters import GRAVITY
 from scenefactory_jax.dynamics.collision import REPORT_S, collect_boxes, make_contact, report_forces
+from scenefactory_jax.roadgraph.elevation import LEVEL_M, Ground, find_ground, find_start_ground, lift_motion
 
 STANDING_MPS = 0.6  # slower, the direction of the velocity says nothing about the heading
 
@@ -34,6 +35,7 @@ class Body:
     contact_force: Float[Array, " A"]
     mu: Float[Array, " A"]
     friction_utilization: Float[Array, " A"]
+    ground: Ground | None = None  # the road under the box's centre; None: it is flat
 
 
 def make(
@@ -63,13 +65,15 @@ def make(
     Raises:
         ConfigError: a number out of range, or an unknown, missing or wrong value of `contact`, by name.
     """
-    collision = make_contact(contact, height=math.inf, step_s=REPORT_S)
+    collision = make_contact(contact, height=LEVEL_M, step_s=REPORT_S)
     read_motion = functools.partial(read, height=centre_height, wheelbase=wheelbase)
 
     def advance(scene: Scene, body: Body, action: Float[Array, "A 3"], active: Bool[Array, " A"]) -> Body:
         throttle, steer, brake = jnp.clip(action, -1.0, 1.0).T
         push, bend = acceleration * (throttle - brake), curvature * steer
         moved = integrate_acceleration(body, push, bend, dt=control_dt)
+        if scene.elevation is not None and body.ground is not None:
+            moved = replace(moved, ground=find_ground(scene.elevation, moved.position, body.ground.height))
         speed = safe_norm(moved.velocity)
         mu = friction(scene.weather, body.position, speed)
         cars = collect_boxes(read_motion(moved), scene.agents.size, active, mass)
@@ -87,7 +91,7 @@ def init(key: PRNGKeyArray, scene: Scene) -> Body:
     agents = scene.agents
     velocity = agents.speed[:, None] * heading_vector(agents.yaw)
     zeros = (jnp.zeros(agents.yaw.shape, jnp.float32) for _ in range(5))  # separate arrays: none may be donated twice
-    return Body(agents.position, agents.yaw, velocity, *zeros)
+    return Body(agents.position, agents.yaw, velocity, *zeros, ground=find_start_ground(scene))
 
 
 def integrate_acceleration(body: Body, acceleration: Float[Array, " A"], curvature: Float[Array, " A"], *, dt: float) -> Body:
@@ -147,7 +151,7 @@ def compute_expert_actions(
 def read(body: Body, *, height: float, wheelbase: float) -> Motion:
     """Reads the motion of the cars."""
     zero = jnp.zeros_like(body.yaw)
-    return Motion(
+    motion = Motion(
         position=jnp.concatenate([body.position, jnp.full_like(zero, height)[:, None]], axis=-1),
         velocity=jnp.concatenate([body.velocity, zero[:, None]], axis=-1),
         yaw=body.yaw,
@@ -159,3 +163,4 @@ def read(body: Body, *, height: float, wheelbase: float) -> Motion:
         friction_utilization=body.friction_utilization,
         slip=zero,
     )
+    return lift_motion(motion, body.ground)

@@ -1,6 +1,5 @@
 """Log playback: cars follow their logged tracks. Actions are ignored; contact forces are reported and do not move the cars."""
 
-import math
 from collections.abc import Callable
 from typing import Any
 
@@ -13,6 +12,7 @@ from scenefactory_jax.core.pytree import pytree_dataclass, replace, tree_where
 from scenefactory_jax.core.track_interpolation import interpolate_track
 from scenefactory_jax.core.types import Dynamics, Motion, Scene
 from scenefactory_jax.dynamics.collision import REPORT_S, collect_boxes, make_contact, report_forces
+from scenefactory_jax.roadgraph.elevation import LEVEL_M, find_ground_by_lane, lift_motion
 
 
 @pytree_dataclass
@@ -38,7 +38,7 @@ def make(
     Raises:
         ConfigError: an unknown or missing value of `contact`.
     """
-    collision = make_contact(contact, height=math.inf, step_s=REPORT_S)
+    collision = make_contact(contact, height=LEVEL_M, step_s=REPORT_S)
 
     def read_log(scene: Scene, steps: Int[Array, " A"]) -> Motion:
         log = scene.log
@@ -46,7 +46,7 @@ def make(
         interpolate = jax.vmap(lambda r, *track: interpolate_track(r, *track, dt=log.dt))
         position, velocity, yaw, yaw_rate = interpolate(row, log.position, log.yaw, log.velocity, log.valid)
         zero = jnp.zeros_like(yaw)
-        return Motion(
+        motion = Motion(
             position=jnp.concatenate([position, jnp.full_like(zero, centre_height)[:, None]], axis=-1),
             velocity=jnp.concatenate([velocity, zero[:, None]], axis=-1),
             yaw=yaw,
@@ -58,6 +58,7 @@ def make(
             friction_utilization=zero,
             slip=zero,
         )
+        return lift_motion(motion, find_ground_by_lane(scene, position, yaw))
 
     def init(key: PRNGKeyArray, scene: Scene) -> Body:
         steps = jnp.zeros(scene.agents.yaw.shape, jnp.int32)

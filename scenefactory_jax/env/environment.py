@@ -35,6 +35,7 @@ from scenefactory_jax.core.types import (
 )
 from scenefactory_jax.env import history, observations, rewards, route_following, spawning, step_metrics, termination, traffic
 from scenefactory_jax.env.history import HistorySpec
+from scenefactory_jax.roadgraph import elevation
 from scenefactory_jax.weather import friction, rain, road_condition
 
 WEIGHTS = 0x77616765  # folded into the key of an agent's start, for its reward weights: apart from the numbers that others fold or split
@@ -267,7 +268,8 @@ def find_truncated_agents(result: StepResult, active: Bool[Array, "*W A"]) -> Bo
 
 def _scene_at(parts: EnvParts, scene: Scene, state: State) -> Scene:
     """Computes the scene at the time of a state: agents and weather of this episode, and the traffic at that time."""
-    return replace(scene, agents=state.agents, weather=state.weather, traffic=parts.traffic.read(scene, state.traffic, state.step))
+    boxes = elevation.read_traffic(parts.traffic, scene, state.traffic, state.step)
+    return replace(scene, agents=state.agents, weather=state.weather, traffic=boxes)
 
 
 def _init_state(parts: EnvParts, key: PRNGKeyArray, scene: Scene, step: Int[Array, ""] | int = 0) -> State:
@@ -275,7 +277,7 @@ def _init_state(parts: EnvParts, key: PRNGKeyArray, scene: Scene, step: Int[Arra
     step = jnp.asarray(step, jnp.int32)
     agents_key, weather_key, key, body_key = jax.random.split(key, 4)
     others = parts.traffic.init(jax.random.fold_in(body_key, 0), scene, step)
-    scene = replace(scene, traffic=parts.traffic.read(scene, others, step))
+    scene = replace(scene, traffic=elevation.read_traffic(parts.traffic, scene, others, step))
     agents = spawning.admit_cars(parts.sample_agents(agents_key, scene))
     weather = rain.advance_rain(parts.sample_weather(weather_key, replace(scene, agents=agents)), dt=parts.control_dt * step)
     body = parts.dynamics.init(body_key, replace(scene, agents=agents, weather=weather))

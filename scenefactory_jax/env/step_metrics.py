@@ -16,7 +16,7 @@ from scenefactory_jax.core.types import Agents, Events, Motion, Scene, State, St
 from scenefactory_jax.dynamics.articulated.parameters import GRAVITY
 from scenefactory_jax.env import route_following, spawning, surrogate_safety
 from scenefactory_jax.env.route_following import RouteConfig
-from scenefactory_jax.roadgraph import queries
+from scenefactory_jax.roadgraph import elevation, queries
 
 
 @dataclasses.dataclass(frozen=True)
@@ -63,9 +63,12 @@ def compute(scene: Scene, before: State, after: State, *, config: StepMetricsCon
     users = surrogate_safety.collect_road_users(motion, after.agents.size, active & ~broken, scene.traffic)
     centres, radius = cover_with_circles(users.position, users.yaw, users.size, **vars(config.circles))
     pairs = surrogate_safety.compare_pairs(centres, radius, users.velocity, motion.yaw, drac_gap_floor_m=config.drac_gap_floor_m)
+    pairs = surrogate_safety.separate_levels(pairs, scene, motion)
     speed, to_goal = safe_norm(velocity), after.agents.goal - position
-    edges = {"half_width_m": config.edge_half_width_m, "range_m": config.edge_range_m, "kernels": config.kernels}
-    road = queries.query_road(scene, centres[:cars], radius[:cars], velocity, motion.yaw, position, active, **edges)
+    leveled = elevation.select_level(scene, motion)
+    kernels = config.kernels and scene.edges.height is None  # they know one level
+    edges = {"half_width_m": config.edge_half_width_m, "range_m": config.edge_range_m, "kernels": kernels}
+    road = queries.query_road(leveled, centres[:cars], radius[:cars], velocity, motion.yaw, position, active, **edges)
     lane, edge_clearance = _compute_lane_metrics(scene, before, road.lane, motion, to_goal), road.edge - config.edge_radius_m
     beside_lane = {"lane_heading": lane["lane_heading"], "lane_offset": lane["lane_offset"]}
     route = route_following.compute_metrics(scene, before, after, speed=speed, **beside_lane, config=config.route, control_dt=control_dt)
@@ -74,7 +77,7 @@ def compute(scene: Scene, before: State, after: State, *, config: StepMetricsCon
         numerical_error=broken,
         goal_reached=(safe_norm(to_goal) <= config.goal_radius_m) & _is_route_driven(after, config.goal_radius_m),
         collision=(motion.contact_force >= config.collision_force_n) & (after.steps_since_spawn >= config.collision_grace_steps),
-        out_of_bounds=_is_out_of_bounds(motion, after.agents, start_distance, config),
+        out_of_bounds=_is_out_of_bounds(scene, motion, after.agents, start_distance, config),
         road_edge_contact=edge_clearance <= 0,
         red_light=route.red_light,
         stop_sign=route.stop_sign,
@@ -112,9 +115,11 @@ def _find_non_finite(state: State) -> Bool[Array, " A"]:
     return ~(is_finite(state.motion) & spawning.find_usable(state.agents))
 
 
-def _is_out_of_bounds(motion: Motion, agents: Agents, start_distance: Float[Array, " A"], config: StepMetricsConfig) -> Bool[Array, " A"]:
+def _is_out_of_bounds(
+    scene: Scene, motion: Motion, agents: Agents, start_distance: Float[Array, " A"], config: StepMetricsConfig
+) -> Bool[Array, " A"]:
     """Whether a car tipped over or fell, is outside the scene, or is further from its start than any way to its goal requires."""
-    fell = (motion.upright < config.upright_min) | (motion.position[:, 2] < config.height_min_m)
+    fell = (motion.upright < config.upright_min) | (elevation.measure_heights(scene, motion) < config.height_min_m)
     outside = jnp.max(jnp.abs(motion.position[:, :2]), axis=1) > 0.5 * config.scene_size_m
     farthest = jnp.maximum(config.max_start_distance_m, config.max_start_distance_ratio * agents.route_length)
     return fell | outside | (start_distance > farthest)

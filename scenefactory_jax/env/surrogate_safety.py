@@ -7,7 +7,8 @@ from jaxtyping import Array, Bool, Float
 
 from scenefactory_jax.core.geometry import SMALLEST, cross, dot, heading_vector, safe_norm
 from scenefactory_jax.core.pytree import is_finite
-from scenefactory_jax.core.types import Boxes, Motion
+from scenefactory_jax.core.types import Boxes, Motion, Scene
+from scenefactory_jax.roadgraph.elevation import LEVEL_M
 
 
 class RoadUsers(NamedTuple):
@@ -83,6 +84,16 @@ def compare_pairs(
     diagonal = jnp.eye(cars, len(radius), dtype=bool)
     ttc, clearance, free = (jnp.where(diagonal, jnp.inf, pairs) for pairs in (ttc, jnp.min(clearance, axis=(2, 3)), free))
     return Pairs(ttc=ttc, drac=jnp.where(diagonal, 0.0, drac), clearance=clearance, ahead=free)
+
+
+def separate_levels(pairs: Pairs, scene: Scene, motion: Motion) -> Pairs:
+    """Takes pairs on different levels of the road for infinitely far apart; scenes of one level stay as they are."""
+    if scene.edges.height is None:
+        return pairs
+    height = motion.position[:, 2]
+    apart = jnp.abs(height[:, None] - jnp.concatenate([height, scene.traffic.elevation])) >= LEVEL_M
+    ttc, clearance, ahead = (jnp.where(apart, jnp.inf, measure) for measure in (pairs.ttc, pairs.clearance, pairs.ahead))
+    return Pairs(ttc, jnp.where(apart, 0.0, pairs.drac), clearance, ahead)
 
 
 def minimum_over_pairs(values: Float[Array, "A B"], present: Bool[Array, " B"]) -> Float[Array, " A"]:

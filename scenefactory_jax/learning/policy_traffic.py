@@ -25,6 +25,7 @@ from scenefactory_jax.env.traffic.log_playback import Row, make_masses, make_sta
 from scenefactory_jax.learning import policy_io
 from scenefactory_jax.learning.policy_vehicles import Drivers, advance, find_drivers, find_entering, init, join, make_act, read_boxes
 from scenefactory_jax.learning.training_loop import make_policy
+from scenefactory_jax.roadgraph.elevation import lift_boxes
 from scenefactory_jax.weather.road_condition import keep_condition
 
 # Groups of a policy's config that are read, besides `observations`
@@ -83,12 +84,12 @@ def policy_traffic(
             return ()
         row = _find_row(scene, step, start_row=start_row, control_dt=control_dt)
         chosen = find_drivers(scene, row, parked_m=parked_m) & ("vehicle" in kinds)
-        return init(drivers, env, key, scene, read_logged(scene, step), chosen, step, row, slots=slots)
+        return init(drivers, env, key, scene, lift_boxes(scene, read_logged(scene, step)), chosen, step, row, slots=slots)
 
     def move(scene: Scene, state: Any, cars: Boxes, step: Int[Array, ""]) -> Any:
         if _is_empty(scene):
             return state
-        state, boxes, cars = jax.lax.stop_gradient((state, read(scene, state, step), cars))
+        state, boxes, cars = jax.lax.stop_gradient((state, lift_boxes(scene, read(scene, state, step)), cars))
         enters = find_entering(state, join(boxes, cars), start_row + (step + 1) * (control_dt / scene.log.dt), clearance_m=clearance_m)
         return advance(parts, env, act, scene, state, boxes, cars, enters, restarts=at_end == "restart")
 
@@ -166,7 +167,7 @@ def make_parts(drivers: Drivers, dynamics: Dynamics, *, ending: list[EventName],
         action_repeat=repeat,
         sample_agents=spawning.logged,
         sample_weather=keep_condition,
-        traffic=make_stateless(lambda scene, step: scene.traffic),
+        traffic=make_stateless(lambda scene, step: scene.traffic)._replace(on_road=True),
         advance_route=functools.partial(route_following.advance, config=metrics.route),
         compute_metrics=functools.partial(step_metrics.compute, config=metrics, control_dt=control_dt),
         evaluate_termination=functools.partial(termination.evaluate, ending=ending),

@@ -103,8 +103,9 @@ def pack(
     starts,
     conflicts,
     controls,
+    elevation,
 ):
-    assert routes is None and starts is None and conflicts is None  # roadgraph tests have routes
+    assert elevation is None and routes is None and starts is None and conflicts is None  # roadgraph tests have routes
     origin, centred_on = _find_centre(raw, centre)
     half = scene_size_m / 2
     road, cut, relief = _segments(raw, origin, half, gap_m, outline_m)

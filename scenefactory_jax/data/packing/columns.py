@@ -4,19 +4,21 @@ The columns, their axes and dtypes follow from the annotations in `types`, so a 
 """
 
 import dataclasses
-from collections.abc import Mapping
+import types
+import typing
+from collections.abc import Iterable, Mapping
 from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 
 from scenefactory_jax.core.pytree import unchecked
-from scenefactory_jax.core.types import DRIVABLE, EDGES, Boxes, Patches, Rain, Road, Scene, SpatialGrid
+from scenefactory_jax.core.types import DRIVABLE, EDGES, Boxes, Elevation, Patches, Rain, Road, Scene, SpatialGrid
 
 T = TypeVar("T")
 
 ROADS = ("road", "lanes", "edges")
 SAMPLED = (Patches, Rain, Boxes)  # parts of a scene that resets sample: no file has them, and packed scenes have none of their rows
-DERIVED = SpatialGrid | None  # computed from the other columns
+ATTACHED = (SpatialGrid | None, Elevation | None)  # no columns: `spatial_grid` and `elevation_grid` make and stack them
 DTYPES = {"float": np.dtype(np.float32), "int": np.dtype(np.int32), "bool": np.dtype(bool)}
 AXES = {  # letter of an annotation -> name; P is the part itself
     "A": "agents", "O": "traffic", "L": "steps", "R": "routes", "N": "route_points", "S": "stops", "Z": "zones", "C": "controls",
@@ -38,19 +40,26 @@ def _read_annotation(annotation: Any, part: str) -> Column:
     return Column(dtype, tuple(int(axis) if axis.isdigit() else (names.get(axis) or axis) for axis in annotation.dim_str.split()))
 
 
-def _describe(kind: Any, prefix: str = "") -> dict[str, Column]:
-    """The columns of all leaves below a struct, by their dotted names."""
+def _describe(kind: Any, prefix: str = "", *, optional: bool) -> dict[str, Column]:
+    """The columns of all leaves below a struct, by their dotted names: those that all scenes have, or those that are optional."""
     columns: dict[str, Column] = {}
     for entry in dataclasses.fields(kind):
         name = prefix + entry.name
         if dataclasses.is_dataclass(entry.type) and entry.type not in SAMPLED:
-            columns |= _describe(entry.type, f"{name}.")
-        elif entry.type not in (*SAMPLED, DERIVED):
-            columns[name] = _read_annotation(entry.type, prefix.rstrip("."))
+            columns |= _describe(entry.type, f"{name}.", optional=optional)
+        elif entry.type not in (*SAMPLED, *ATTACHED) and isinstance(entry.type, types.UnionType) == optional:
+            annotation = typing.get_args(entry.type)[0] if optional else entry.type
+            columns[name] = _read_annotation(annotation, prefix.rstrip("."))
     return columns
 
 
-COLUMNS: dict[str, Column] = _describe(Scene)
+COLUMNS: dict[str, Column] = _describe(Scene, optional=False)
+OPTIONAL: dict[str, Column] = _describe(Scene, optional=True)
+
+
+def columns_of(world: Iterable[str]) -> dict[str, Column]:
+    """The columns of a scene with these leaves."""
+    return COLUMNS | {name: column for name, column in OPTIONAL.items() if name in world}
 
 
 def assemble_columns(kind: type[T], columns: Mapping[str, np.ndarray], prefix: str = "") -> T:
@@ -58,7 +67,7 @@ def assemble_columns(kind: type[T], columns: Mapping[str, np.ndarray], prefix: s
     leaves: dict[str, Any] = {}
     for entry in dataclasses.fields(kind):  # pyright: ignore[reportArgumentType]
         struct: Any = entry.type
-        if struct == DERIVED:
+        if struct in ATTACHED:
             leaves[entry.name] = None
         elif struct in SAMPLED:
             worlds = columns["log.dt"].shape  # () or the number of stacked scenes
@@ -69,7 +78,8 @@ def assemble_columns(kind: type[T], columns: Mapping[str, np.ndarray], prefix: s
         elif dataclasses.is_dataclass(struct):
             leaves[entry.name] = assemble_columns(struct, columns, f"{prefix}{entry.name}.")  # pyright: ignore[reportArgumentType]
         else:
-            leaves[entry.name] = columns[prefix + entry.name]
+            name = prefix + entry.name
+            leaves[entry.name] = columns.get(name) if name in OPTIONAL else columns[name]
     return unchecked(kind, **leaves)
 
 
@@ -78,7 +88,7 @@ def flatten(value: Any, prefix: str = "") -> dict[str, np.ndarray]:
     leaves: dict[str, np.ndarray] = {}
     for entry in dataclasses.fields(value):
         leaf, name = getattr(value, entry.name), prefix + entry.name
-        if not isinstance(leaf, (*SAMPLED, DERIVED)):
+        if leaf is not None and not isinstance(leaf, (*SAMPLED, *ATTACHED)):
             leaves |= flatten(leaf, f"{name}.") if dataclasses.is_dataclass(leaf) else {name: np.asarray(leaf)}
     return leaves
 
@@ -87,5 +97,5 @@ def with_subsets(columns: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
     """Adds `lanes` and `edges`, which repeat rows of `road`, to the columns of one scene."""
     kinds = {"lanes": DRIVABLE, "edges": EDGES}
     masks = {part: np.isin(columns["road.kind"], chosen) & columns["road.valid"] for part, chosen in kinds.items()}
-    fields = [entry.name for entry in dataclasses.fields(Road)]
+    fields = [entry.name for entry in dataclasses.fields(Road) if f"road.{entry.name}" in columns]
     return dict(columns) | {f"{part}.{name}": columns[f"road.{name}"][mask] for part, mask in masks.items() for name in fields}

@@ -10,14 +10,16 @@ from typing import Annotated, Any, Literal, NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float
 
+from scenefactory_jax.core.pytree import unchecked
 from scenefactory_jax.core.raw_scene import Polyline, RawScene, Unpackable
 from scenefactory_jax.core.scene_arrays import Logs, join_lines, segment_lengths, stack_tracks, wrap_angles
 from scenefactory_jax.core.schema import Bounds, ConfigError, Positive
-from scenefactory_jax.core.types import DRIVABLE, POLYGONS, ROAD_USERS, Scene
+from scenefactory_jax.core.types import DRIVABLE, POLYGONS, ROAD_USERS, Elevation, Scene
 from scenefactory_jax.data.formats.polylines import densify
-from scenefactory_jax.data.packing import columns, control_columns, drawn_starts, route_columns, route_conflicts
+from scenefactory_jax.data.packing import columns, control_columns, drawn_starts, elevation_grid, route_columns, route_conflicts
 from scenefactory_jax.data.packing.control_columns import ControlsConfig
 from scenefactory_jax.data.packing.drawn_starts import Conflicts, find_conflicts
+from scenefactory_jax.data.packing.elevation_grid import ElevationConfig
 from scenefactory_jax.data.packing.route_columns import RouteConfig, RouteCounts
 
 DEGENERATE_M = 1e-6  # shorter segments have no direction
@@ -25,7 +27,7 @@ DROPS: tuple[str, ...] = (
     "not_a_vehicle", "absent_at_start", "start_outside_box", "goal_outside_box", "too_short", "no_conflict", "overlaps", "over_capacity",
 )  # fmt: skip
 TRAFFIC_DROPS: tuple[str, ...] = ("absent_from_start_on", "outside_box", "overlaps_agent", "over_capacity")
-REFUSALS: tuple[str, ...] = ("no_lane_in_box", "no_agent_left")  # why a scene is not packed
+REFUSALS: tuple[str, ...] = ("no_lane_in_box", "no_agent_left", "levels")  # why a scene is not packed
 CUTS: tuple[str, ...] = ("outside_box", "gap", "degenerate")
 
 
@@ -51,7 +53,7 @@ class PackReport:
     signs_inferred: int  # stop signs whose lanes were inferred
     segments_kept: int
     segments_cut: dict[str, int]  # reason of CUTS -> count
-    relief_m: float  # height between the lowest and the highest kept road point: the packed scene is flat
+    relief_m: float  # height between the lowest and the highest kept road point
     repairs: tuple[str, ...] = ()
     metadata: dict[str, Any] = field(default_factory=dict)
     raw: RawScene | None = None  # the checked scene itself, where it is kept
@@ -102,6 +104,7 @@ def pack(
     starts: dict[str, Any] | None,
     conflicts: Conflicts | None,
     controls: ControlsConfig,
+    elevation: ElevationConfig | None,
 ) -> tuple[Scene, PackReport]:
     """Packs a checked scene into numpy leaves of its own size, without padding but absent agent slots.
 
@@ -111,7 +114,7 @@ def pack(
         Unpackable: no lane segment in the box, or no agent where one is required.
     """
     (origin, centred_on), half = _find_centre(raw, centre), scene_size_m / 2
-    road, cut, relief = _segments(raw, origin, half, gap_m, outline_m)
+    road, cut, relief = _segments(raw, origin, half, gap_m, outline_m, elevation)
     logs = stack_tracks(raw.tracks, len(raw.times))
     logs = logs._replace(xyz=logs.xyz - np.array([origin[0], origin[1], 0.0]))
     allowed = np.ones(len(raw.tracks), bool) if conflicts is None else find_conflicts(raw, logs, conflicts)
@@ -125,10 +128,9 @@ def pack(
     leaves["log.dt"] = np.median(np.diff(raw.times)) if len(raw.times) > 1 else np.ones(())
     beside, others, traffic_dropped = _traffic(raw, logs, chosen, leaves, half, first, traffic, min_traffic_size_m)
     stops = control_columns.pack_controls(raw, origin, half, controls)
-    leaves |= beside | stops.columns
-    who = {"agents": chosen, "slots": agents, "traffic": others, "size": beside["traffic_log.size"]}
+    who = {"agents": chosen, "slots": agents, "traffic": others, "size": beside["traffic_log.size"], "road": road}
     added, counts = _routes(raw, logs, origin, half, **who, controls=stops.columns, config=routes)
-    leaves |= added
+    leaves |= beside | stops.columns | added
     if starts is not None:
         leaves |= drawn_starts.draw_agents(leaves, starts, row=raw.current - first, slots=agents, car_size_m=car_size_m)
     if require_agents and not leaves["agents.present"].any():
@@ -147,7 +149,15 @@ def pack(
         segments_cut=cut,
         relief_m=relief,
     )
-    return columns.assemble_columns(Scene, {name: np.asarray(leaf, columns.COLUMNS[name].dtype) for name, leaf in leaves.items()}), report
+    heights = None if elevation is None else elevation_grid.fit_elevation(raw, origin, half, elevation)
+    return _assemble(leaves, heights), report
+
+
+def _assemble(leaves: dict[str, np.ndarray], elevation: Elevation | None) -> Scene:
+    """The scene of these columns."""
+    dtypes = {name: column.dtype for name, column in columns.columns_of(leaves).items()}
+    scene = columns.assemble_columns(Scene, {name: np.asarray(leaf, dtypes[name]) for name, leaf in leaves.items()})
+    return unchecked(Scene, **vars(scene) | {"elevation": elevation})
 
 
 def _list_drops(dropped: dict[str, int]) -> str:
@@ -172,13 +182,14 @@ def _describe_source(
 
 
 def _routes(
-    raw: RawScene, logs: Logs, *place: Any, slots: int, traffic: list[int], size: np.ndarray, config: RouteConfig | None, **who: Any
-) -> tuple[dict[str, np.ndarray], RouteCounts | None]:
+    raw: RawScene, logs: Logs, *place: Any, slots: int, traffic: list[int], size: np.ndarray, road: dict[str, np.ndarray],
+    config: RouteConfig | None, **who: Any,
+) -> tuple[dict[str, np.ndarray], RouteCounts | None]:  # fmt: skip
     """Columns of the routes and their counts; without a config there are none."""
     if config is None:
         return route_columns.make_no_routes(slots, len(traffic)) | route_conflicts.make_no_zones(len(traffic)), None
     found, counts = route_columns.pack_routes(raw, logs, *place, slots=slots, traffic=traffic, config=config, **who)
-    return found | route_conflicts.find_zones(found | {"traffic_log.size": size}), counts
+    return found | route_conflicts.find_zones(road | found | {"traffic_log.size": size}), counts
 
 
 def _find_centre(raw: RawScene, centre: str) -> tuple[Float[np.ndarray, "3"], str]:
@@ -195,7 +206,7 @@ def _find_centre(raw: RawScene, centre: str) -> tuple[Float[np.ndarray, "3"], st
 
 
 def _segments(
-    raw: RawScene, origin: Float[np.ndarray, "3"], half: float, gap_m: float, outline_m: float
+    raw: RawScene, origin: Float[np.ndarray, "3"], half: float, gap_m: float, outline_m: float, elevation: ElevationConfig | None
 ) -> tuple[dict[str, np.ndarray], dict[str, int], float]:
     """Columns of `road` in storage order, the count of segments cut by reason, and the heights' range."""
     order = sorted((i for i, line in enumerate(raw.roads) if len(line.xyz) >= 2), key=lambda i: raw.roads[i].kind)  # stable
@@ -227,6 +238,8 @@ def _segments(
         "road.polyline": np.array(order)[line],
         "road.valid": np.ones(len(rows), bool),
     }
+    if elevation is not None and elevation.levels > 1:
+        road["road.height"] = (xyz[rows + 1, 2] + xyz[rows, 2]) / 2 - origin[2]
     if not np.isin(kind[line], DRIVABLE).any():
         place = f"{half:g} m of {np.round(origin, 2).tolist()}"
         raise Unpackable("no_lane_in_box", f"{raw.source}: roads: no driving lane within {place}; cut: {cut}")

@@ -33,10 +33,11 @@ class Line(NamedTuple):
 
     points: Float[np.ndarray, "N 2"]
     directions: Float[np.ndarray, "N 2"]  # of length 1
+    height: Float[np.ndarray, " N"]  # zeros where roads have one level
 
 
 def find_zones(leaves: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """Computes `zone_enter`, `zone_leave` and `zone_match` of a scene's traffic from its columns."""
+    """Computes `zone_enter`, `zone_leave` and `zone_match` of a scene's traffic from its columns; with `road.height`, level by level."""
     has_route, size = leaves["traffic_log.has_route"], leaves["traffic_log.size"]
     lines = {int(row): _read_line(leaves, int(row)) for row in np.flatnonzero(has_route)}
     found = {f"traffic_log.{name}": np.full((len(has_route), len(has_route), ZONES), np.inf) for name in NAMES}
@@ -58,9 +59,10 @@ def find_pair_zones(line: Line, other: Line, reach_m: float) -> list[Zone]:
     if len(line.points) < 2 or len(other.points) < 2:
         return []
     (start, stop), (other_start, other_stop) = _find_part(line, other, reach_m), _find_part(other, line, reach_m)
+    rise = line.height[start:stop, None] - other.height[None, other_start:other_stop]
     part, other_part = line.points[start:stop], other.points[other_start:other_stop]
     squared = np.square(part[:, None, 0] - other_part[None, :, 0]) + np.square(part[:, None, 1] - other_part[None, :, 1])
-    near = squared < reach_m**2
+    near = squared + rise * rise < reach_m**2
     zones = []
     for begin, end in _find_runs(np.any(near, axis=1)):
         rows, columns = np.nonzero(near[begin:end])
@@ -78,12 +80,23 @@ def find_pair_zones(line: Line, other: Line, reach_m: float) -> list[Zone]:
 
 def _read_line(leaves: Mapping[str, np.ndarray], row: int) -> Line:
     """The points of a vehicle's route up to its end."""
-    route = leaves["traffic_log.route"][row]
+    route = int(leaves["traffic_log.route"][row])
     points = leaves["routes.position"][route, : int(np.ceil(leaves["routes.length"][route] / ROUTE_SPACING_M)) + 1]
+    height = _find_heights(leaves, points, route)
     if len(points) < 2:  # no direction, no zones
-        return Line(points, points)
+        return Line(points, points, height)
     along = np.gradient(points, axis=0)
-    return Line(points, along / np.maximum(np.linalg.norm(along, axis=1, keepdims=True), 1e-9))
+    return Line(points, along / np.maximum(np.linalg.norm(along, axis=1, keepdims=True), 1e-9), height)
+
+
+def _find_heights(leaves: Mapping[str, np.ndarray], points: Float[np.ndarray, "N 2"], route: int) -> Float[np.ndarray, " N"]:
+    """Heights of a route's points: of the nearest segment of their lane, for points beside lanes of the nearest segment of any."""
+    if "road.height" not in leaves:
+        return np.zeros(len(points))
+    place, line, lane = leaves["road.midpoint"], leaves["road.polyline"], leaves["routes.lane"][route, : len(points)]
+    apart = (lane[:, None] >= 0) & (lane[:, None] != line)
+    squared = np.square(points[:, None] - place).sum(axis=2)
+    return leaves["road.height"][np.argmin(np.where(apart, np.inf, squared), axis=1)]
 
 
 def _find_part(line: Line, other: Line, reach_m: float) -> tuple[int, int]:

@@ -8,9 +8,10 @@ import numpy as np
 from scipy.spatial import KDTree
 
 from scenefactory_jax.core import schema
+from scenefactory_jax.core.pytree import unchecked
 from scenefactory_jax.core.raw_scene import SceneError
 from scenefactory_jax.core.types import Scene
-from scenefactory_jax.data.packing import columns
+from scenefactory_jax.data.packing import columns, elevation_grid
 
 ROUTE_AXES = ("routes", "route_points", "stops", "zones", "controls", "changes")
 AXES = (*columns.ROADS, "agents", "steps", "traffic", *ROUTE_AXES)
@@ -89,8 +90,10 @@ def stack(scenes: Sequence[Scene], *, capacity: Mapping[str, int | None]) -> tup
         sizes[axis] = round_rows(axis, max(int(axis not in MAY_BE_EMPTY), *(_count(world, axis) for world in worlds)))
     cuts: list[CutCounts] = []
     padded = [_fit(world, sizes, index, cuts) for index, world in enumerate(worlds)]
-    stacked = {name: np.stack([world[name] for world in padded]) for name in columns.COLUMNS}
-    return columns.assemble_columns(Scene, stacked), CutReport(len(scenes), sizes, tuple(cuts))
+    elevation = elevation_grid.stack_elevations([scene.elevation for scene in scenes])
+    stacked = {name: np.stack([world[name] for world in padded]) for name in columns.columns_of(padded[0])}
+    scene = columns.assemble_columns(Scene, stacked)
+    return unchecked(Scene, **vars(scene) | {"elevation": elevation}), CutReport(len(scenes), sizes, tuple(cuts))
 
 
 def describe(report: CutReport) -> list[str]:
@@ -121,7 +124,7 @@ def _count(world: Leaves, axis: str) -> int:
 def _take(world: Leaves, axis: str, rows: np.ndarray) -> Leaves:
     """The world with only these rows of an axis."""
     taken = dict(world)
-    for name, column in columns.COLUMNS.items():
+    for name, column in columns.columns_of(world).items():
         for place in [place for place, other in enumerate(column.axes) if other == axis]:
             taken[name] = np.take(taken[name], rows, axis=place)
     return taken
@@ -165,7 +168,7 @@ def _find_nearest(world: Leaves, part: str, rows: int) -> tuple[np.ndarray, floa
 
 def _pad(name: str, leaf: np.ndarray, sizes: Mapping[str, int]) -> np.ndarray:
     """Adds zeros and false masks behind the rows; sizes of absent cars repeat the last, because they are divisors."""
-    axes = columns.COLUMNS[name].axes
+    axes = columns.columns_of({name})[name].axes
     missing = [(0, sizes[axis] - rows if isinstance(axis, str) else 0) for axis, rows in zip(axes, leaf.shape, strict=True)]
     if not any(after for _, after in missing):
         return leaf

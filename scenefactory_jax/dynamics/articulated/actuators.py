@@ -102,16 +102,16 @@ def compute_body_ground_force(car: CarParameters, state: CarState) -> tuple[Vect
     A car on its wheels never touches. A car that rolls over lies on springs and dampers. Friction is the damper's force, limited by
     `body_friction` times the normal force.
     """
-    force = torque = Vector(0.0, 0.0, 0.0)
+    force, torque, up = Vector(0.0, 0.0, 0.0), Vector(0.0, 0.0, 0.0), state.normal
     for side in (0.5, -0.5):  # the roof's corners, then the floor's, in the order of the wheels
         arm = Vector(AHEAD * (car.length / 2), LEFT * (car.width / 2), side * car.height)
-        depth = -(state.height + dot(state.up, arm))
+        depth = -(state.height + dot(up, arm))
         velocity = state.velocity + cross(state.rate, arm)
-        vertical = dot(state.up, velocity)
+        vertical = dot(up, velocity)
         normal = jnp.where(depth > 0.0, jnp.maximum(car.body_stiffness * depth - car.body_damping * vertical, 0.0), 0.0)
-        sliding = velocity - state.up * vertical
+        sliding = velocity - up * vertical
         drag = length(*sliding) * car.body_damping
         scale = jnp.minimum(1.0, car.body_friction * normal / jnp.maximum(drag, 1.0))
-        corner = state.up * normal - sliding * (scale * car.body_damping)
+        corner = up * normal - sliding * (scale * car.body_damping)
         force, torque = force + sum_vectors(corner), torque + sum_vectors(cross(arm, corner))
     return force, torque

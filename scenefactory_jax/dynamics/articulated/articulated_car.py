@@ -16,7 +16,7 @@ from jaxtyping import Array, Bool, Float, PRNGKeyArray
 from scenefactory_jax.core.geometry import heading_vector, safe_norm
 from scenefactory_jax.core.instantiate import ConfigError, instantiate
 from scenefactory_jax.core.pytree import pytree_dataclass, replace, tree_where
-from scenefactory_jax.core.types import Dynamics, Motion, Scene
+from scenefactory_jax.core.types import Dynamics, Elevation, Motion, Scene
 from scenefactory_jax.dynamics import collision
 from scenefactory_jax.dynamics.articulated import actuators, closed_form_step, equations_of_motion, mjx_backend
 from scenefactory_jax.dynamics.articulated import model as models
@@ -34,6 +34,7 @@ from scenefactory_jax.dynamics.articulated.tyres import (
 )
 from scenefactory_jax.dynamics.articulated.vector import Vector, dot
 from scenefactory_jax.dynamics.collision import Contact, ContactState, advance_boxes, collect_boxes
+from scenefactory_jax.roadgraph.elevation import find_start_ground
 
 
 class CarCarry(NamedTuple):
@@ -149,7 +150,7 @@ def make_dynamics(compiled: CompiledCar, contact: Contact, friction: Callable[..
 
 
 def init(compiled: CompiledCar, contact: Contact, key: PRNGKeyArray, scene: Scene) -> Body:
-    """Places cars at their starts, at rest height, with rolling wheels."""
+    """Places cars at their starts, at rest height along the road, with rolling wheels."""
     agents, at = scene.agents, compiled.addresses
     count = agents.yaw.shape[0]
     half = agents.yaw / 2.0
@@ -165,6 +166,8 @@ def init(compiled: CompiledCar, contact: Contact, key: PRNGKeyArray, scene: Scen
     velocity = agents.speed[:, None] * heading_vector(agents.yaw)
     radius = jnp.broadcast_to((constants or compiled.constants).car.wheel_radius, (count,))
     qvel = jnp.zeros((count, 16), jnp.float32).at[:, :2].set(velocity)
+    if (ground := find_start_ground(scene)) is not None:
+        qpos, qvel = jax.vmap(states.place_on_road)(ground, qpos, qvel)
     return Body(
         qpos=qpos,
         qvel=qvel.at[:, at.spin_v].set((agents.speed / radius)[:, None]),
@@ -203,7 +206,8 @@ def control_step(
     if mu.shape != wheels.shape[:-1] or not jnp.issubdtype(mu.dtype, jnp.floating):
         raise ConfigError(f"weather.friction: expected floating-point numbers {list(wheels.shape[:-1])}, got {mu.dtype} {list(mu.shape)}")
     command = actuators.compute_command(car, action)
-    step = jax.vmap(functools.partial(physics_step, compiled), in_axes=(None if body.constants is None else 0, 0, 0, 0, 0, 0))
+    each = None if body.constants is None else 0
+    step = jax.vmap(functools.partial(physics_step, compiled), in_axes=(each, 0, 0, 0, 0, 0, None))
     mass = equations_of_motion.total_mass(car)
     neighbours = contact.neighbours(collect_boxes(motion, scene.agents.size, active, mass), scene.traffic)
 
@@ -212,7 +216,7 @@ def control_step(
         beside = neighbours._replace(boxes=advance_boxes(neighbours.boxes, time))
         state, force, torque, strength = contact.forces(body.contact, boxes, beside)
         carry = CarCarry(body.qpos, body.qvel, body.qacc_warmstart, body.tyres)
-        carry = step(constants, fields, carry, command, PlanarForce(force, torque), mu)
+        carry = step(constants, fields, carry, command, PlanarForce(force, torque), mu, scene.elevation)
         return replace(body, **carry._asdict(), contact=state, contact_force=jnp.maximum(body.contact_force, strength)), None
 
     zero = jnp.zeros_like(body.contact_force)
@@ -230,6 +234,7 @@ def physics_step(
     command: Command,
     push: PlanarForce,
     mu: Float[Array, "4"],
+    elevation: Elevation | None = None,
 ) -> CarCarry:
     """Computes one physics step of one car.
 
@@ -237,8 +242,9 @@ def physics_step(
         fields: of MJX's model, if the solver is `newton` and the car differs from the reference.
         push: from other cars and objects.
         mu: friction coefficient under each wheel.
+        elevation: heights of the road; None: it is flat.
     """
-    car, state = constants.car, states.from_mujoco(constants.car, carry.qpos, carry.qvel)
+    car, state = constants.car, states.from_mujoco(constants.car, carry.qpos, carry.qvel, elevation)
     patch = find_contact_patches(car, state)
     drive = actuators.compute_drive_torque(car, command.throttle, state)
     brake = command.brake_torque + car.rolling_torque
@@ -251,7 +257,8 @@ def physics_step(
         iterations, dt = compiled.solver.iterations, compiled.physics_dt
         after = closed_form_step.step(inputs, *joints, iterations=iterations, physics_dt=dt)
     else:
-        after = mjx_backend.step(compiled.mjx_car, fields, inputs, *joints)
+        plane = {} if elevation is None else mjx_backend.fit_ground(compiled.mjx_car, state, carry.qpos[:3])
+        after = mjx_backend.step(compiled.mjx_car, fields | plane, inputs, *joints)
     qpos, qvel, acceleration, normal = after
     return CarCarry(qpos, qvel, acceleration, compute_outputs(patch, tyre, normal, mu))
 

@@ -25,6 +25,8 @@ from scenefactory_jax.dynamics.articulated.closed_form_step import StepInput
 from scenefactory_jax.dynamics.articulated.constants import CarConstants
 from scenefactory_jax.dynamics.articulated.model import ModelAddresses, find_addresses
 from scenefactory_jax.dynamics.articulated.parameters import AHEAD, LEFT
+from scenefactory_jax.dynamics.articulated.state import CarState
+from scenefactory_jax.dynamics.articulated.vector import Vector, dot
 
 
 class MjxCar(NamedTuple):
@@ -34,12 +36,14 @@ class MjxCar(NamedTuple):
     data: mjx.Data  # template; a step writes four of its fields
     addresses: ModelAddresses
     rows: np.ndarray  # [4] constraint rows of the tyres
+    ground: int  # geom
 
 
 def put_model(model: mujoco.MjModel) -> MjxCar:
     """Puts the compiled car on the device."""
     data = mjx.make_data(model, impl="jax")
-    return MjxCar(mjx.put_model(model, impl="jax"), data, find_addresses(model), np.asarray(data._impl.contact.efc_address))
+    rows, ground = np.asarray(data._impl.contact.efc_address), model.geom("ground").id
+    return MjxCar(mjx.put_model(model, impl="jax"), data, find_addresses(model), rows, ground)
 
 
 def fit_model(mjx_car: MjxCar, constants: CarConstants) -> dict[str, Array]:
@@ -67,6 +71,17 @@ def fit_model(mjx_car: MjxCar, constants: CarConstants) -> dict[str, Array]:
         "pair_solref": model.pair_solref.at[:, 0].set(car.tyre_time_constant),
         "pair_solimp": model.pair_solimp.at[:, :2].set(car.tyre_impedance),
     }
+
+
+def fit_ground(mjx_car: MjxCar, state: CarState, centre: Float[Array, "3"]) -> dict[str, Array]:
+    """Computes the model's fields of a ground that is the mean of the planes under the four wheels; `centre` of the box, in the world."""
+    model = mjx_car.model
+    across = Vector(*(part.mean() for part in state.normal))
+    normal = jnp.stack([dot(axis, across) for axis in (state.east, state.north, state.up)])
+    normal = normal / jnp.linalg.norm(normal)
+    turn = jnp.stack([1.0 + normal[2], -normal[1], normal[0], jnp.zeros_like(normal[0])])
+    position = model.geom_pos.at[mjx_car.ground].set(centre - normal * state.height.mean())
+    return {"geom_pos": position, "geom_quat": model.geom_quat.at[mjx_car.ground].set(turn / jnp.linalg.norm(turn))}
 
 
 def step(

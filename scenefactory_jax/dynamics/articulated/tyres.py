@@ -81,7 +81,7 @@ class TyreForces(NamedTuple):
 
 def find_contact_patches(car: CarParameters, state: CarState) -> Patch:
     """Computes the lowest point of each ellipsoid: -S up / sqrt(up . S up) from its centre, S the matrix of its squared half axes."""
-    up, axle = state.up, state.axle
+    up, axle = state.normal, state.axle
     lean = dot(axle, up)
     round_, oval = car.wheel_radius**2, (car.wheel_width / 2) ** 2 - car.wheel_radius**2
     reach = jnp.sqrt(round_ + oval * lean * lean)  # from the hub down to the lowest point
@@ -218,9 +218,10 @@ def make_normal_rows(constants: CarConstants, state: CarState, patch: Patch, *, 
     car = constants.car
     impedance = jnp.clip(car.tyre_impedance, *IMPEDANCE_RANGE)
     constant = jnp.maximum(car.tyre_time_constant, 2 * physics_dt)  # MuJoCo's `refsafe`
-    lever = cross(patch.arm, state.up)
-    jacobian = [*state.up, *cross(state.hub + patch.arm, state.up), state.up.z, dot(state.axle, lever), FRONT * lever.z]
-    reference = patch.depth / (impedance * constant**2) - 2.0 / (impedance * constant) * dot(state.up, patch.velocity)
+    up = state.normal
+    lever = cross(patch.arm, up)
+    jacobian = [*up, *cross(state.hub + patch.arm, up), up.z, dot(state.axle, lever), FRONT * lever.z]
+    reference = patch.depth / (impedance * constant**2) - 2.0 / (impedance * constant) * dot(up, patch.velocity)
     regularization = constants.wheel_weight * (1.0 - impedance) / impedance
     weight = jnp.where(patch.depth > 0.0, 1.0, 0.0) / jnp.maximum(regularization, MIN_REGULARIZATION)
     return NormalRows(jacobian, reference, weight)

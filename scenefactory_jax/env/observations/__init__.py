@@ -26,7 +26,7 @@ from scenefactory_jax.env.observations.planning import planning
 from scenefactory_jax.env.observations.reward_vector import reward_weights
 from scenefactory_jax.env.observations.road_set import road
 from scenefactory_jax.env.observations.route_vector import route
-from scenefactory_jax.env.observations.state_vectors import ego, friction_ahead, weather, yaw_rate_and_steer
+from scenefactory_jax.env.observations.state_vectors import ego, friction_ahead, grade_ahead, weather, yaw_rate_and_steer
 from scenefactory_jax.env.observations.vmax import vmax_base, vmax_lane, vmax_road, vmax_segment
 
 __all__ = ["ANY", "FRACTION", "LENGTH", "SIGNED", "Group", "bound_observation", "make", "observe"]
@@ -34,6 +34,7 @@ __all__ += [
     "closest_approach",
     "ego",
     "friction_ahead",
+    "grade_ahead",
     "lane",
     "leader",
     "lights",

@@ -5,11 +5,12 @@ from collections.abc import Callable
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from scenefactory_jax.core.geometry import heading_vector, safe_norm, to_frame
+from scenefactory_jax.core.geometry import dot, heading_vector, safe_norm, to_frame
 from scenefactory_jax.core.schema import ConfigError, NonNegative, Positive
 from scenefactory_jax.core.types import SURFACES, Scene, State
 from scenefactory_jax.env import route_following
 from scenefactory_jax.env.observations.column_bounds import ANY, FRACTION, LENGTH, SIGNED, bound_observation
+from scenefactory_jax.roadgraph.elevation import find_ground
 from scenefactory_jax.weather.patches import read_condition
 
 
@@ -56,16 +57,44 @@ def friction_ahead(
     Args:
         friction: `weather.friction` of the config, bound; the environment supplies it.
     """
-    agents, motion = state.agents, state.motion
+    points, _ = _find_points_ahead(scene, state, ahead_m)
+    speed = jnp.broadcast_to(safe_norm(state.motion.velocity[:, :2])[:, None], points.shape[:2])
+    return friction(state.weather, points, speed)
+
+
+def grade_ahead(scene: Scene, state: State, *, ahead_m: list[NonNegative], grade_scale: Positive) -> Float[Array, "A F"]:
+    """Rise over run of the road along the agent's way: under the car's centre, then at each of `ahead_m`, as in `friction_ahead`.
+
+    The last column is the bank: the rise to the left of the car. All are zero on a flat road.
+
+    Args:
+        grade_scale: the grade that reads 1.
+    """
+    points, direction = _find_points_ahead(scene, state, ahead_m)
+    if scene.elevation is None:
+        return jnp.zeros((len(points), points.shape[1] + 1), jnp.float32)
+    yaw = state.motion.yaw
+    slope = find_ground(scene.elevation, points, jnp.broadcast_to(state.motion.position[:, 2:], points.shape[:2])).slope
+    heading = heading_vector(yaw)[:, None]
+    if direction is not None:
+        direction = jnp.where(route_following.find_routed(scene, state.agents)[:, None, None], direction, heading)
+    ahead = dot(slope[:, 1:], heading if direction is None else direction)
+    here = [dot(slope[:, 0], heading_vector(yaw + turn))[:, None] for turn in (0.0, 0.5 * jnp.pi)]
+    return jnp.concatenate([here[0], ahead, here[1]], axis=1) / grade_scale
+
+
+def _find_points_ahead(
+    scene: Scene, state: State, ahead_m: list[NonNegative]
+) -> tuple[Float[Array, "A M 2"], Float[Array, "A N 2"] | None]:
+    """Computes the places under each car and ahead of it, and the directions of its route there; None without routes."""
+    agents, motion, direction = state.agents, state.motion, None
     here, ahead = motion.position[:, None, :2], jnp.array(ahead_m, jnp.float32)
     points = here + ahead[:, None] * heading_vector(motion.yaw)[:, None]
     if scene.routes.length.shape[0]:
         row = jnp.broadcast_to(agents.route[:, None], points.shape[:2])
-        along, _ = route_following.find_point(scene, row, state.route.arc[:, None] + ahead)
+        along, direction = route_following.find_point(scene, row, state.route.arc[:, None] + ahead)
         points = jnp.where(route_following.find_routed(scene, agents)[:, None, None], along, points)
-    points = jnp.concatenate([here, points], axis=1)
-    speed = jnp.broadcast_to(safe_norm(motion.velocity[:, :2])[:, None], points.shape[:2])
-    return friction(state.weather, points, speed)
+    return jnp.concatenate([here, points], axis=1), direction
 
 
 def yaw_rate_and_steer(scene: Scene, state: State, *, turn_scale_radps: Positive, steer_scale_rad: Positive) -> Float[Array, "A 2"]:

@@ -54,8 +54,10 @@ def sample_start(settings: Mapping[str, Any], scene: Scene, *, seed: int) -> Wor
         scene: one world.
 
     Raises:
-        ConfigError: a key that does not fit, or no car starts in this scene.
+        ConfigError: a key that does not fit, a scene with heights, or no car starts in this scene.
     """
+    if scene.elevation is not None:
+        raise ConfigError("scenes.pack.elevation: an exported world is flat; expected null (scenes/pack/elevation=flat)")
     env, (reference, _) = environment.make_env(settings), read_parameters(settings["dynamics"])
     compute_mu = friction.make(settings["weather"]["friction"])
 

@@ -13,6 +13,7 @@ from scenefactory_jax.core.scene_arrays import wrap_angles
 from scenefactory_jax.core.schema import ConfigError, NonNegative, Positive
 from scenefactory_jax.core.types import CROSSWALK, DRIVEWAY, EDGE_BOUNDARY, EDGE_MEDIAN, STOP_SIGN
 from scenefactory_jax.data.generators.curves import Points, heading, resample
+from scenefactory_jax.data.generators.town.hills import Hills, add_hills
 from scenefactory_jax.data.generators.town.road_network import Network
 from scenefactory_jax.data.generators.town.road_users import TownUser
 from scenefactory_jax.data.generators.town.traffic import add_warmup
@@ -21,6 +22,7 @@ from scenefactory_jax.data.generators.town.traffic_lights import Gates
 PACKAGE = "scenefactory_jax.data.generators.town"
 MAX_REDRAWS = 40  # towns that are drawn until one can be built and has enough moving cars
 MAX_TRAFFIC_REDRAWS = 3  # on one network
+HILLS = 0x68696C6C  # of the seed of the hills, so that a town is the same with and without them
 
 
 class Log(NamedTuple):
@@ -54,6 +56,7 @@ def generate(
     warmup_s: NonNegative,
     max_sdc_distance_m: Positive,
     sensor_range_m: Positive,
+    hills: Hills | None,
 ) -> RawScene:
     """Generates scene `index` of the series `seed`: a road network, traffic lights and simulated traffic.
 
@@ -88,6 +91,8 @@ def generate(
         scene = _draw_scene(rng, kind, reach_m, parts, log, lane_spacing_m, line_spacing_m)
         if scene is not None:
             name, source = f"{scene.name}-{seed}-{index:06d}", f"generator, seed {seed}, index {index}"
+            if hills is not None:
+                scene = add_hills(scene, np.random.default_rng(np.random.SeedSequence((seed, index, redraw, HILLS))), hills)
             return replace(scene, name=name, source=source, metadata=scene.metadata | {"seed": seed, "index": index})
     raise SceneError(f"generate.traffic.cars: {MAX_REDRAWS} towns had fewer than {log.min_cars} moving cars; give a lower minimum")
 
