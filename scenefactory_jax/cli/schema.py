@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 from typing import Annotated, Any, Literal
 
 from scenefactory_jax.cli.hydra_config import find_conf
+from scenefactory_jax.core.distributed import Distributed
 from scenefactory_jax.core.schema import Bounds, ConfigError, Count, NonNegative, Positive, Seed, check
 from scenefactory_jax.evaluation.metrics.agent_metrics import METRICS
 from scenefactory_jax.evaluation.settings import Episodes, Failures, ScoreSettings, Video
@@ -100,6 +101,7 @@ class Train(Task):
     seed: Seed
     worlds: Count
     devices: Count | None
+    distributed: Distributed
     iterations: Count
     minutes: NonNegative | None
     checkpoint_every: Count
