@@ -8,6 +8,7 @@ All goes through the store of `jax.distributed`'s coordinator, which the first p
 """
 
 import contextlib
+import ctypes
 import json
 import logging
 import os
@@ -27,6 +28,7 @@ from scenefactory_jax.core.schema import ConfigError, Count, Positive, Seed
 FOREVER_MS = 10**9  # a process that waits is ended by its watch, not by a time limit
 BEATS = 20  # signs of life within `timeout_s`
 MAX_BEAT_S = 1.0
+LINGER_S = 5.0  # of the first process, until the others have ended: when it is lost, JAX ends them with messages of its own
 MAX_LETTERS = 400  # of a reason
 HINT = "all processes end; `resume=true` goes on from the last checkpoint"
 
@@ -69,9 +71,13 @@ def join(settings: Distributed) -> Iterator[None]:
     except BaseException as error:
         if _is_lost_peer(error):
             time.sleep(settings.timeout_s + 2 * MAX_BEAT_S)  # the watch finds out which one, and ends this process
-        global_state.client.key_value_set(f"ended/{global_state.process_id}", _shorten(error), allow_overwrite=True)
-        _linger(settings.timeout_s)
-        raise
+            error = ConfigError(f"distributed: the network or another process failed: {_shorten(error)}; {HINT}")
+        ended.set()
+        with contextlib.suppress(Exception):  # the first process may be lost
+            global_state.client.key_value_set(f"ended/{global_state.process_id}", _shorten(error), allow_overwrite=True)
+            _linger()
+        _abandon()
+        raise error
     ended.set()
     thread.join()
     jax.distributed.shutdown()
@@ -95,6 +101,22 @@ def share(name: str, compute: Callable[[], Any]) -> Any:
     return value
 
 
+def compile_together(name: str, function: Any) -> Any:
+    """A compiled function whose first call waits until every process has compiled it: collective operations have time limits of their own."""
+    client = global_state.client
+    if client is None or not callable(function):
+        return function
+    waiting = [name]
+
+    def call(*arguments: Any) -> Any:
+        if waiting:
+            function.lower(*arguments).compile()
+            client.wait_at_barrier(f"compiled/{waiting.pop()}", FOREVER_MS)
+        return function(*arguments)
+
+    return call
+
+
 def share_stop(iteration: int, *, late: bool, signal: int | None) -> tuple[bool, int | None]:
     """Whether the time is up by the first process's clock, and the signal to stop that any process has received (None: none).
 
@@ -115,17 +137,20 @@ def _connect(settings: Distributed) -> None:
     """Starts `jax.distributed`, with what is not given found from Slurm, Kubernetes or Open MPI."""
     jax.config.update("jax_enable_preemption_service", False)  # it would take SIGTERM; the training loop has its own way with it
     given = {"coordinator_address": settings.coordinator, "num_processes": settings.processes, "process_id": settings.process}
-    where = f"coordinator={settings.coordinator}, processes={settings.processes}, process={settings.process}"
-    limits = {"initialization_timeout": int(settings.start_s), "heartbeat_timeout_seconds": int(2 * settings.timeout_s) + 10}
+    where = f"distributed: coordinator={settings.coordinator}, processes={settings.processes}, process={settings.process}"
+    late = threading.Timer(settings.start_s, _end, [f"{where}: not all processes came within start_s={settings.start_s:g} s"])
+    late.daemon = True
+    late.start()  # before JAX's own limit, at which it aborts
+    limits = {"initialization_timeout": int(settings.start_s) + 60, "heartbeat_timeout_seconds": int(2 * settings.timeout_s) + 10}
     try:
         jax.distributed.initialize(**given, **limits)
-    except ValueError as error:
+    except (ValueError, RuntimeError) as error:
         raise ConfigError(
-            f"distributed: {where}: {_shorten(error)}; give coordinator=HOST:PORT, processes=N and process=0..N-1,"
+            f"{where}: {_shorten(error)}; give coordinator=HOST:PORT, processes=N and process=0..N-1,"
             " or start it by srun, mpirun or an indexed Job of Kubernetes, which tell these"
         ) from None
-    except RuntimeError as error:
-        raise ConfigError(f"distributed: {where}: not all processes came within start_s={settings.start_s:g}: {_shorten(error)}") from None
+    finally:
+        late.cancel()
     global_state.client.key_value_set(f"host/{global_state.process_id}", socket.gethostname())
     if not is_first():
         logging.getLogger("scenefactory_jax").setLevel(logging.WARNING)
@@ -152,15 +177,27 @@ def _watch(timeout_s: float, ended: threading.Event) -> None:
         if found := [(number, reason) for number, reason in others if number != str(me)]:
             number, reason = found[0]
             host = dict(client.key_value_dir_get("host/")).get(f"host/{number}", "?")
-            print(f"error: process {number} of {global_state.num_processes} on {host}: {reason}; {HINT}", file=sys.stderr, flush=True)
-            _linger(timeout_s)
-            os._exit(2)
+            _end(f"process {number} of {global_state.num_processes} on {host}: {reason}; {HINT}")
 
 
-def _linger(timeout_s: float) -> None:
-    """The first process stays until the others have read why all end: without it JAX ends them."""
+def _end(reason: str) -> None:
+    """Ends this process from another thread: the main one waits for an answer that does not come."""
+    print(f"error: {reason}", file=sys.stderr, flush=True)
+    _linger()
+    os._exit(2)
+
+
+def _abandon() -> None:
+    """Drops JAX's client and coordinator as they are: at the end of Python they would wait for the other processes, and abort."""
+    for part in (global_state.client, global_state.service):
+        ctypes.pythonapi.Py_IncRef(ctypes.py_object(part))  # never destroyed
+    global_state.client = global_state.service = None
+
+
+def _linger() -> None:
+    """The first process stays until the others have read why all end."""
     if is_first():
-        time.sleep(4 * _beat_s(timeout_s))
+        time.sleep(LINGER_S)
 
 
 def _beat_s(timeout_s: float) -> float:

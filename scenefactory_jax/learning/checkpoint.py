@@ -29,7 +29,7 @@ Arrays = dict[str, np.ndarray]
 def save(folder: Path | str, train_state: Any, *, keep: int, host: Mapping[str, Any] | None = None) -> Path:
     """Writes a train state under its iteration's number and keeps the `keep` newest checkpoints of the folder.
 
-    Of several processes all call it, and the first one writes.
+    Of several processes all call it; the first one writes, and the others wait for it.
 
     Args:
         host: plain JSON values to save with it.
@@ -43,6 +43,7 @@ def save(folder: Path | str, train_state: Any, *, keep: int, host: Mapping[str, 
     file = _path(folder, int(train_state.iteration))
     arrays: Arrays = sharding.fetch({name: _to_data(leaf) for name, leaf in _name_leaves(train_state).items() if leaf.size})
     if not distributed.is_first():
+        distributed.share(f"saved/{file.stem}", lambda: None)
         return file
     arrays |= {} if host is None else {HOST: np.array(json.dumps(host))}
     file.parent.mkdir(parents=True, exist_ok=True)
@@ -55,6 +56,7 @@ def save(folder: Path | str, train_state: Any, *, keep: int, host: Mapping[str, 
         raise OSError(error.errno, f"{error.strerror}; {hint}", str(file)) from None
     for old in _list_iterations(folder)[:-keep]:
         _path(folder, old).unlink()
+    distributed.share(f"saved/{file.stem}", lambda: None)
     return file
 
 

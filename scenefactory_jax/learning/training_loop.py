@@ -102,16 +102,17 @@ def train(
     watching = loggers.make(config["loggers"])
     scene_source.use_compilation_cache()
     prepared = prepared or prepare(config)
+    trainer = Trainer(*(distributed.compile_together(name, part) for name, part in prepared.trainer._asdict().items()))
     with run_folder.open_run_folder(config) as (folder, resume):
         with contextlib.ExitStack() as stack:
             before = checkpoint.restore_host(folder / "checkpoints") if resume else None
             worlds, flow = stack.enter_context(_open_scenes(config, folder, prepared, before))
-            state = prepared.trainer.init(jax.random.key(config["seed"]), worlds)
+            state = trainer.init(jax.random.key(config["seed"]), worlds)
             if resume:
                 state = checkpoint.restore(folder / "checkpoints", state)
                 LOG.info(f"resumed at iteration {int(state.iteration)}")
             before = before and before.get("samples")
-            samples = stack.enter_context(sample_stream.open_stream(config, prepared.trainer, state, mesh=prepared.mesh, before=before))
+            samples = stack.enter_context(sample_stream.open_stream(config, trainer, state, mesh=prepared.mesh, before=before))
             first = int(state.iteration) if resume else None
             callbacks = [on_iteration] if on_iteration else []
             if distributed.is_first():
@@ -119,7 +120,7 @@ def train(
             if callback := make_callback and distributed.is_first() and make_callback(folder, first):
                 callbacks.insert(0, lambda state, row: callback(get_policy_parameters(state), row))
             streams = Streams(flow, samples)
-            state = _loop(config, folder, prepared.trainer, worlds, state, streams, watching, first=first, callbacks=callbacks)
+            state = _loop(config, folder, trainer, worlds, state, streams, watching, first=first, callbacks=callbacks)
         if finish is not None and distributed.is_first():
             finish(folder)
     return Run(folder, config, prepared.env, prepared.policy, state, metrics_csv.read(folder))

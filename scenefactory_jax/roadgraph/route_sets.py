@@ -12,6 +12,7 @@ import numpy as np
 import shapely
 from jaxtyping import Float, Int
 
+from scenefactory_jax.core.scene_arrays import segment_lengths
 from scenefactory_jax.core.types import ROUTE_SPACING_M
 from scenefactory_jax.roadgraph import lane_graph
 from scenefactory_jax.roadgraph.lane_graph import LaneGraph
@@ -137,15 +138,26 @@ def sample_lanes(lanes: LaneMap, chain: tuple[int, ...], behind: float, max_leng
     graph = lanes.graph
     pieces, owners = [], []
     for place, lane in enumerate(chain):
-        line = graph.xyz[graph.first[lane] : graph.first[lane + 1], :2]
-        arc = graph.arc[graph.first[lane] : graph.first[lane + 1]]
+        line, arc = _take_lane(graph, lane)
         if place == 0:
-            first = lane_graph.point_at(graph, np.array([lane]), np.array([behind]))[0][:, :2]
-            line = np.concatenate([first, line[arc > behind]])
+            line = np.concatenate([_point_on(line, arc, behind)[None], line[arc > behind]])
         pieces.append(line)
         owners.append(np.full(len(line), lane))
     xy, length, nearest = resample(np.concatenate(pieces), max_length_m)
     return SampledRoute(xy, np.concatenate(owners)[nearest], length, chain, on_route=False, along_lanes=True)
+
+
+def _take_lane(graph: LaneGraph, lane: int) -> tuple[Float[np.ndarray, "V 2"], Float[np.ndarray, " V"]]:
+    """The vertices of one lane, and the length along it up to each."""
+    rows = slice(graph.first[lane], graph.first[lane + 1])
+    return graph.xyz[rows, :2], graph.arc[rows]
+
+
+def _point_on(line: Float[np.ndarray, "V 2"], arc: Float[np.ndarray, " V"], at: float) -> Float[np.ndarray, "2"]:
+    """The point at a length along one lane, as `lane_graph.point_at` computes it for many."""
+    at = min(max(at, 0.0), arc[-1])
+    segment = min(int(np.searchsorted(arc, at, side="right")) - 1, len(arc) - 2)
+    return line[segment] + (at - arc[segment]) / (arc[segment + 1] - arc[segment]) * (line[segment + 1] - line[segment])
 
 
 def sample_track(track: Float[np.ndarray, "L 2"], max_length_m: float) -> SampledRoute:
@@ -156,15 +168,20 @@ def sample_track(track: Float[np.ndarray, "L 2"], max_length_m: float) -> Sample
 
 def resample(line: Float[np.ndarray, "V 2"], max_length_m: float) -> tuple[Float[np.ndarray, "N 2"], float, Int[np.ndarray, " N"]]:
     """Points every ROUTE_SPACING_M along a line and its end, the length, and the vertex at or after each point."""
-    step = np.linalg.norm(np.diff(line, axis=0), axis=1)
-    line = line[np.concatenate([[True], step > 1e-3])]
-    used = np.flatnonzero(np.concatenate([[True], step > 1e-3]))
-    arc = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(line, axis=0), axis=1))])
+    step = segment_lengths(line[1:] - line[:-1])
+    used = np.concatenate([[0], 1 + np.flatnonzero(step > 1e-3)])
+    if len(used) < len(line):
+        line = line[used]
+        step = segment_lengths(line[1:] - line[:-1])
+    arc = np.zeros(len(line))
+    np.cumsum(step, out=arc[1:])
     length = min(float(arc[-1]), max_length_m)
     places = np.append(np.arange(0.0, length, ROUTE_SPACING_M), length)
     if len(places) > 1 and places[-1] - places[-2] < 1e-3:
         places = np.delete(places, -2)
-    xy = np.stack([np.interp(places, arc, line[:, axis]) for axis in (0, 1)], axis=1)
+    xy = np.empty((len(places), 2))
+    for axis in (0, 1):
+        xy[:, axis] = np.interp(places, arc, line[:, axis])
     return xy, length, used[np.minimum(np.searchsorted(arc, places), len(arc) - 1)]
 
 
@@ -191,15 +208,18 @@ def draw_routes(
     winding, straight = list[SampledRoute](), list[SampledRoute]()
     if not len(graph.id):
         return []
-    chance = graph.length / graph.length.sum()
+    chance = np.cumsum(graph.length / graph.length.sum())
+    chance /= chance[-1]
     most_winding = round(count * turn_fraction)
-    for _ in range(attempts):
-        lane = int(rng.choice(len(chance), p=chance))
+    for _ in range(attempts):  # the draws are those of `rng.choice`, which checks its arguments each time
+        lane = int(np.searchsorted(chance, rng.random(), side="right"))
         behind = float(rng.uniform(0.0, graph.length[lane]))
         chain, length = [lane], float(graph.length[lane]) - behind
         while length < length_m[1] and (further := [row for row in lanes.successors[chain[-1]] if row not in chain]):
-            chain.append(int(rng.choice(further)))
+            chain.append(further[int(rng.integers(0, len(further)))])
             length += float(graph.length[chain[-1]])
+        if np.abs(_point_on(*_take_lane(graph, lane), behind) - centre).max() > half_m:
+            continue  # it begins outside
         route = cut_to_square(sample_lanes(lanes, tuple(chain), behind, length_m[1]), centre, half_m)
         if route is not None and route.length >= length_m[0]:
             (winding if is_winding(route.xy) else straight).append(route)
@@ -211,7 +231,8 @@ def draw_routes(
 
 def cut_to_square(route: SampledRoute, centre: Float[np.ndarray, "2"], half_m: float) -> SampledRoute | None:
     """The route until it leaves a square; None if it begins outside, or is shorter than one step."""
-    outside = np.flatnonzero(np.abs(route.xy - centre).max(axis=1) > half_m)
+    away = np.abs(route.xy - centre)
+    outside = np.flatnonzero(np.maximum(away[:, 0], away[:, 1]) > half_m)
     if not len(outside):
         return route if len(route.xy) > 1 else None
     end = int(outside[0])
@@ -224,5 +245,5 @@ def is_winding(xy: Float[np.ndarray, "N 2"], *, turn_deg: float = 45.0, detour: 
     """Whether a route turns by 45 degrees or more, or is 1.15 times longer than its chord (the suite `route100`'s definition)."""
     step = np.diff(xy, axis=0)
     heading = np.unwrap(np.arctan2(step[:, 1], step[:, 0]))
-    length, chord = np.linalg.norm(step, axis=1).sum(), np.linalg.norm(xy[-1] - xy[0])
+    length, chord = segment_lengths(step).sum(), np.linalg.norm(xy[-1] - xy[0])
     return bool(np.ptp(heading) >= np.deg2rad(turn_deg) or length >= detour * chord)
