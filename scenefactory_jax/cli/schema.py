@@ -349,11 +349,7 @@ def _check_seeds(seeds: list[int] | None) -> None:
 
 
 def check_terminations(names: list[str], *, where: str) -> None:
-    """Checks that protocols are options of the group `termination`.
-
-    Raises:
-        ConfigError: no or an unknown protocol.
-    """
+    """Checks that protocols are options of the group `termination`; ConfigError for none or an unknown one."""
     valid = sorted(path.stem for path in (find_conf() / "termination").glob("*.yaml"))
     if not names or not set(names) <= set(valid):
         raise ConfigError(f"{where}: expected one or more of {', '.join(valid)}, got {names}")

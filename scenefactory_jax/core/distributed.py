@@ -21,7 +21,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import jax
-from jax._src.distributed import global_state  # the store has no public name yet; Orbax reads it here, too
+from jax._src import distributed as jax_distributed  # the store has no public name yet; Orbax reads it here, too
 
 from scenefactory_jax.core.schema import ConfigError, Count, Positive, Seed
 
@@ -30,6 +30,7 @@ BEATS = 20  # signs of life within `timeout_s`
 MAX_BEAT_S = 1.0
 LINGER_S = 5.0  # of the first process, until the others have ended: when it is lost, JAX ends them with messages of its own
 MAX_LETTERS = 400  # of a reason
+STATE: Any = jax_distributed.global_state  # of this process
 HINT = "all processes end; `resume=true` goes on from the last checkpoint"
 
 
@@ -74,7 +75,7 @@ def join(settings: Distributed) -> Iterator[None]:
             error = ConfigError(f"distributed: the network or another process failed: {_shorten(error)}; {HINT}")
         ended.set()
         with contextlib.suppress(Exception):  # the first process may be lost
-            global_state.client.key_value_set(f"ended/{global_state.process_id}", _shorten(error), allow_overwrite=True)
+            STATE.client.key_value_set(f"ended/{STATE.process_id}", _shorten(error), allow_overwrite=True)
             _linger()
         _abandon()
         raise error
@@ -87,23 +88,23 @@ def join(settings: Distributed) -> Iterator[None]:
 
 def is_first() -> bool:
     """Whether this process writes what is written once: files, logs, the bar of progress."""
-    return global_state.process_id == 0
+    return STATE.process_id == 0
 
 
 def share(name: str, compute: Callable[[], Any]) -> Any:
     """The JSON value that the first process computes, in every process; each name has one value."""
-    if global_state.client is None:
+    if STATE.client is None:
         return compute()
     if not is_first():
-        return json.loads(global_state.client.blocking_key_value_get(f"shared/{name}", FOREVER_MS))
+        return json.loads(STATE.client.blocking_key_value_get(f"shared/{name}", FOREVER_MS))
     value = compute()
-    global_state.client.key_value_set(f"shared/{name}", json.dumps(value))
+    STATE.client.key_value_set(f"shared/{name}", json.dumps(value))
     return value
 
 
 def compile_together(name: str, function: Any) -> Any:
-    """A compiled function whose first call waits until every process has compiled it: collective operations have time limits of their own."""
-    client = global_state.client
+    """A compiled function whose first call waits until every process has compiled it: sums over devices have time limits of their own."""
+    client = STATE.client
     if client is None or not callable(function):
         return function
     waiting = [name]
@@ -120,13 +121,13 @@ def compile_together(name: str, function: Any) -> Any:
 def share_stop(iteration: int, *, late: bool, signal: int | None) -> tuple[bool, int | None]:
     """Whether the time is up by the first process's clock, and the signal to stop that any process has received (None: none).
 
-    Called by all after each iteration; the first process decides, so that all stop after the same one.
+    Called by all after each iteration, in which they sum over all devices; the first process decides, so that all stop after the same one.
     """
-    client = global_state.client
+    client = STATE.client
     if client is None:
         return late, signal
     if signal is not None:
-        client.key_value_set(f"signal/{global_state.process_id}", str(signal), allow_overwrite=True)
+        client.key_value_set(f"signal/{STATE.process_id}", str(signal), allow_overwrite=True)
     late, signal = share(f"stop/{iteration}", lambda: [late, next((int(one) for _, one in client.key_value_dir_get("signal/")), None)])
     if is_first():  # the others have read the one before: they took part in this iteration
         client.key_value_delete(f"shared/stop/{iteration - 1}")
@@ -136,14 +137,15 @@ def share_stop(iteration: int, *, late: bool, signal: int | None) -> tuple[bool,
 def _connect(settings: Distributed) -> None:
     """Starts `jax.distributed`, with what is not given found from Slurm, Kubernetes or Open MPI."""
     jax.config.update("jax_enable_preemption_service", False)  # it would take SIGTERM; the training loop has its own way with it
-    given = {"coordinator_address": settings.coordinator, "num_processes": settings.processes, "process_id": settings.process}
+    given: dict[str, Any] = {"coordinator_address": settings.coordinator, "num_processes": settings.processes}
+    given |= {"process_id": settings.process}
     where = f"distributed: coordinator={settings.coordinator}, processes={settings.processes}, process={settings.process}"
     late = threading.Timer(settings.start_s, _end, [f"{where}: not all processes came within start_s={settings.start_s:g} s"])
     late.daemon = True
     late.start()  # before JAX's own limit, at which it aborts
-    limits = {"initialization_timeout": int(settings.start_s) + 60, "heartbeat_timeout_seconds": int(2 * settings.timeout_s) + 10}
+    given |= {"initialization_timeout": int(settings.start_s) + 60, "heartbeat_timeout_seconds": int(2 * settings.timeout_s) + 10}
     try:
-        jax.distributed.initialize(**given, **limits)
+        jax.distributed.initialize(**given)
     except (ValueError, RuntimeError) as error:
         raise ConfigError(
             f"{where}: {_shorten(error)}; give coordinator=HOST:PORT, processes=N and process=0..N-1,"
@@ -151,7 +153,7 @@ def _connect(settings: Distributed) -> None:
         ) from None
     finally:
         late.cancel()
-    global_state.client.key_value_set(f"host/{global_state.process_id}", socket.gethostname())
+    STATE.client.key_value_set(f"host/{STATE.process_id}", socket.gethostname())
     if not is_first():
         logging.getLogger("scenefactory_jax").setLevel(logging.WARNING)
 
@@ -161,7 +163,8 @@ def _watch(timeout_s: float, ended: threading.Event) -> None:
 
     Where the first process is lost, JAX itself ends the others, with its own message.
     """
-    client, me, beat, seen = global_state.client, global_state.process_id, 0, dict[str, tuple[str, float]]()
+    client, me, beat = STATE.client, STATE.process_id, 0
+    seen = {f"alive/{number}": ("", time.monotonic()) for number in range(STATE.num_processes)}  # last sign and its time
     while not ended.wait(_beat_s(timeout_s)):
         beat += 1
         try:
@@ -170,14 +173,13 @@ def _watch(timeout_s: float, ended: threading.Event) -> None:
         except Exception:  # the first process does not answer
             continue
         now = time.monotonic()
-        for key, value in alive:
-            seen[key] = seen[key] if key in seen and seen[key][0] == value else (value, now)
+        seen |= {key: (value, now) for key, value in alive if seen[key][0] != value}
         lost = [(key, f"has given no sign of life for {timeout_s:g} s") for key, (_, when) in seen.items() if now - when > timeout_s]
         others = [(key.rpartition("/")[2], reason) for key, reason in (*reasons, *lost)]
         if found := [(number, reason) for number, reason in others if number != str(me)]:
             number, reason = found[0]
             host = dict(client.key_value_dir_get("host/")).get(f"host/{number}", "?")
-            _end(f"process {number} of {global_state.num_processes} on {host}: {reason}; {HINT}")
+            _end(f"process {number} of {STATE.num_processes} on {host}: {reason}; {HINT}")
 
 
 def _end(reason: str) -> None:
@@ -189,9 +191,9 @@ def _end(reason: str) -> None:
 
 def _abandon() -> None:
     """Drops JAX's client and coordinator as they are: at the end of Python they would wait for the other processes, and abort."""
-    for part in (global_state.client, global_state.service):
+    for part in (STATE.client, STATE.service):
         ctypes.pythonapi.Py_IncRef(ctypes.py_object(part))  # never destroyed
-    global_state.client = global_state.service = None
+    STATE.client = STATE.service = None
 
 
 def _linger() -> None:

@@ -135,4 +135,8 @@ def fetch(tree: Any) -> Any:
 
 
 def _gather(leaf: Array) -> Array:
-    return leaf if leaf.is_fully_replicated else jax.jit(lambda x: x, out_shardings=NamedSharding(leaf.sharding.mesh, PartitionSpec()))(leaf)
+    if leaf.is_fully_replicated:
+        return leaf
+    assert isinstance(leaf.sharding, NamedSharding)
+    everywhere = NamedSharding(leaf.sharding.mesh, PartitionSpec())
+    return jax.jit(lambda x: x, out_shardings=everywhere)(leaf)

@@ -25,7 +25,7 @@ class LaneGraph(NamedTuple):
     first: Int[np.ndarray, " M"]  # row of each lane's first vertex, and the number of vertices: M = N + 1
     xyz: Float[np.ndarray, "V 3"]  # vertices, lane after lane
     arc: Float[np.ndarray, " V"]  # length along the lane up to each vertex
-    shift: Float[np.ndarray, " N"]  # added to the lengths along each lane they increase over all lanes, so that one search finds all segments
+    shift: Float[np.ndarray, " N"]  # with which lengths along lanes increase over all lanes: one search finds all segments
 
 
 class LaneProjections(NamedTuple):

@@ -36,7 +36,7 @@ def test_a_process_that_is_killed_missing_or_stopped_is_told_in_one_line():
     first, second, third = run(3, "kill")
     assert third[0] == -9
     for one in (first, second):
-        assert one[0] == 2 and "error: process 2 of 3 on " in one[2] and "no sign of life for 2 s; all processes end;" in one[2]
+        assert one[0] == 2 and "error: process 2 of 3 on " in one[2] and "no sign of life for 6 s; all processes end;" in one[2]
     (alone,) = run(2, "wait", started=1)
     assert alone[0] == 2 and "processes=2, process=0: not all processes came within start_s=5 s" in alone[2]
     assert [one[:2] for one in run(2, "stop")] == [(3, "shared\nended: 15\n")] * 2
