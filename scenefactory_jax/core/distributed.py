@@ -23,6 +23,7 @@ from typing import Any
 import jax
 from jax._src import distributed as jax_distributed  # the store has no public name yet; Orbax reads it here, too
 
+from scenefactory_jax.core.raw_scene import SceneError
 from scenefactory_jax.core.schema import ConfigError, Count, Positive, Seed
 
 FOREVER_MS = 10**9  # a process that waits is ended by its watch, not by a time limit
@@ -184,7 +185,8 @@ def _watch(timeout_s: float, ended: threading.Event) -> None:
 
 def _end(reason: str) -> None:
     """Ends this process from another thread: the main one waits for an answer that does not come."""
-    print(f"error: {reason}", file=sys.stderr, flush=True)
+    sys.stderr.write(f"error: {reason}\n")
+    sys.stderr.flush()
     _linger()
     os._exit(2)
 
@@ -213,4 +215,4 @@ def _is_lost_peer(error: BaseException) -> bool:
 
 def _shorten(error: BaseException) -> str:
     text = " ".join(str(error).split())
-    return (text if isinstance(error, OSError | ConfigError) else f"{type(error).__name__}: {text}")[:MAX_LETTERS]
+    return (text if isinstance(error, OSError | ConfigError | SceneError) else f"{type(error).__name__}: {text}")[:MAX_LETTERS]

@@ -123,8 +123,7 @@ def _drop_parts(chains: list[tuple[int, ...]]) -> list[tuple[int, ...]]:
 
 def _measure_distances(lanes: LaneMap, rows: list[int], track: Float[np.ndarray, "L 2"]) -> dict[int, Float[np.ndarray, " L"]]:
     """Distances of a track's points from each of these lanes."""
-    points = shapely.points(track)
-    return {row: np.asarray(shapely.distance(lanes.shapes[row], points)) for row in rows}
+    return dict(zip(rows, shapely.distance(lanes.shapes[rows][:, None], shapely.points(track)), strict=True))
 
 
 def sample_chain(lanes: LaneMap, chain: tuple[int, ...], start: Float[np.ndarray, "2"], max_length_m: float) -> SampledRoute:

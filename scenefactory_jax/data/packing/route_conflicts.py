@@ -16,6 +16,7 @@ NAMES = ("zone_enter", "zone_leave", "zone_match")
 ZONES = 2  # of a pair of vehicles that are kept, the first ones
 MARGIN_M = 0.4  # between the sides of two vehicles
 SAME_WAY_COSINE = 0.6  # between two routes in a zone, on average: they lead the same way
+STRIDE = 8  # points of which one is looked at first
 GAP_POINTS = 3  # stretches of a route that are not farther apart are one
 
 
@@ -71,6 +72,8 @@ def find_pair_zones(line: Line, other: Line, reach_m: float) -> list[Zone]:
     other_start, other_stop = _find_part(other, line, reach_m) if stop else (0, 0)
     if not other_stop:
         return []
+    if not _may_meet(line.points[start:stop], other.points[other_start:other_stop], reach_m):
+        return []
     part, other_part = line.points[start:stop], other.points[other_start:other_stop]
     squared = np.square(part[:, None, 0] - other_part[None, :, 0]) + np.square(part[:, None, 1] - other_part[None, :, 1])
     near = squared < reach_m**2
@@ -105,6 +108,13 @@ def _find_part(line: Line, other: Line, reach_m: float) -> tuple[int, int]:
     inside = (line.points >= other.low - reach_m) & (line.points <= other.high + reach_m)
     rows = np.flatnonzero(inside[:, 0] & inside[:, 1])
     return (int(rows[0]), int(rows[-1]) + 1) if len(rows) else (0, 0)
+
+
+def _may_meet(part: Float[np.ndarray, "N 2"], other: Float[np.ndarray, "M 2"], reach_m: float) -> bool:
+    """Whether two stretches may come within reach: no point is farther than STRIDE points from one that is looked at."""
+    few, others = part[::STRIDE], other[::STRIDE]
+    squared = np.square(few[:, None, 0] - others[None, :, 0]) + np.square(few[:, None, 1] - others[None, :, 1])
+    return bool(squared.min() <= (reach_m + 2 * STRIDE * ROUTE_SPACING_M) ** 2)
 
 
 def _find_runs(mask: Bool[np.ndarray, " N"]) -> list[tuple[int, int]]:
