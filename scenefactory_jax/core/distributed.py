@@ -69,7 +69,7 @@ def join(settings: Distributed) -> Iterator[None]:
             if not signal.args:
                 raise
             stopped = signal
-        share("end", lambda: None)
+        STATE.client.wait_at_barrier("end", FOREVER_MS)
     except BaseException as error:
         if _is_lost_peer(error):
             time.sleep(settings.timeout_s + 2 * MAX_BEAT_S)  # the watch finds out which one, and ends this process
