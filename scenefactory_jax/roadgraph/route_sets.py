@@ -20,6 +20,8 @@ from scenefactory_jax.roadgraph.lane_graph import LaneGraph
 ROOT_RADIUS_M = (2.5, 5.0)  # of the lanes at which routes begin: the second if there is none within the first
 ROOT_COSINE = 0.5  # between lane and car
 MAX_LANES = 10  # of a chain
+BOUND_SLACK_M = 1e-6  # far above the rounding of a distance
+STRIDE = 4  # vertices of a lane of which one is looked at first
 MAX_CHAINS = 400  # from one root: at the largest junctions chains of later branches are left out
 
 
@@ -41,6 +43,9 @@ class LaneMap(NamedTuple):
     successors: tuple[tuple[int, ...], ...]
     shapes: np.ndarray  # shapely's lines
     tree: shapely.STRtree
+    few: Int[np.ndarray, " K"]  # every STRIDE-th vertex of each lane and its last one, lane after lane
+    first_few: Int[np.ndarray, " M"]  # row in `few` of each lane's first one, and the number of rows
+    gap_m: Float[np.ndarray, " N"]  # longest way along each lane between two of them
 
 
 def make_lane_map(graph: LaneGraph) -> LaneMap:
@@ -49,7 +54,13 @@ def make_lane_map(graph: LaneGraph) -> LaneMap:
     for lane, successor in graph.successor.tolist():
         following[lane].append(successor)
     shapes = lane_graph.lane_shapes(graph)
-    return LaneMap(graph, tuple(tuple(sorted(set(rows))) for rows in following), shapes, shapely.STRtree(shapes))
+    owner = np.repeat(np.arange(len(graph.id)), np.diff(graph.first))
+    place = np.arange(len(owner)) - graph.first[owner]
+    few = np.flatnonzero((place % STRIDE == 0) | (place + 1 == np.diff(graph.first)[owner]))
+    gap = np.zeros(len(graph.id))
+    np.maximum.at(gap, owner[few[1:]], np.where(owner[few[1:]] == owner[few[:-1]], graph.arc[few[1:]] - graph.arc[few[:-1]], 0.0))
+    successors = tuple(tuple(sorted(set(rows))) for rows in following)
+    return LaneMap(graph, successors, shapes, shapely.STRtree(shapes), few, np.searchsorted(owner[few], np.arange(len(graph.id) + 1)), gap)
 
 
 def find_track_routes(
@@ -70,8 +81,7 @@ def find_track_routes(
     kept = _drop_parts(chains)
     if not kept:
         return [sample_track(track, max_length_m)]
-    distance = _measure_distances(lanes, sorted({lane for chain in kept for lane in chain}), track)
-    offsets = [np.min([distance[lane] for lane in chain], axis=0) for chain in kept]
+    offsets = _measure_offsets(lanes, kept, track)
     order = sorted(range(len(kept)), key=lambda place: float(offsets[place].sum()))[:count]
     if offsets[order[0]].max() > max_distance_m:
         return [sample_track(track, max_length_m)]
@@ -121,9 +131,27 @@ def _drop_parts(chains: list[tuple[int, ...]]) -> list[tuple[int, ...]]:
     return [chain for bits, chain in kept.items() if not any(bits & other == bits and bits != other for other in kept)]
 
 
-def _measure_distances(lanes: LaneMap, rows: list[int], track: Float[np.ndarray, "L 2"]) -> dict[int, Float[np.ndarray, " L"]]:
-    """Distances of a track's points from each of these lanes."""
-    return dict(zip(rows, shapely.distance(lanes.shapes[rows][:, None], shapely.points(track)), strict=True))
+def _measure_offsets(lanes: LaneMap, chains: list[tuple[int, ...]], track: Float[np.ndarray, "L 2"]) -> list[Float[np.ndarray, " L"]]:
+    """Distances of a track's points from each chain.
+
+    Distances from few vertices bound those from the lanes, and tell which lanes may be the nearest of a chain; only these are measured.
+    """
+    rows = np.array(sorted({lane for chain in chains for lane in chain}))
+    counts = lanes.first_few[rows + 1] - lanes.first_few[rows]
+    starts = np.cumsum(counts) - counts
+    few = lanes.graph.xyz[lanes.few[np.repeat(lanes.first_few[rows] - starts, counts) + np.arange(counts.sum())]]
+    squared = np.square(few[:, 0, None] - track[:, 0]) + np.square(few[:, 1, None] - track[:, 1])
+    most = np.sqrt(np.minimum.reduceat(squared, starts, axis=0))
+    least = most - lanes.gap_m[rows, None] / 2 - BOUND_SLACK_M
+    row = {lane: place for place, lane in enumerate(rows.tolist())}
+    members = [[row[lane] for lane in chain] for chain in chains]
+    nearest = np.full(most.shape, -np.inf)
+    for member in members:
+        nearest[member] = np.maximum(nearest[member], most[member].min(axis=0))
+    lane, point = np.nonzero(least <= nearest)
+    distance = np.full(most.shape, np.inf)
+    distance[lane, point] = shapely.distance(lanes.shapes[rows[lane]], shapely.points(track)[point])
+    return [distance[member].min(axis=0) for member in members]
 
 
 def sample_chain(lanes: LaneMap, chain: tuple[int, ...], start: Float[np.ndarray, "2"], max_length_m: float) -> SampledRoute:
