@@ -74,7 +74,7 @@ def join_lines(lines: Sequence[Polyline]) -> Points:
     return join_points([line.xyz for line in lines])
 
 
-def join_points(xyz: Sequence[Float[np.ndarray, "N 3"]]) -> Points:
+def join_points(xyz: Sequence[Float[np.ndarray, "_ 3"]]) -> Points:
     """Joins the points of lines."""
     return Points(np.concatenate([*xyz, np.zeros((0, 3))]), np.cumsum([0, *map(len, xyz)]))
 
