@@ -25,7 +25,8 @@ class LaneGraph(NamedTuple):
     first: Int[np.ndarray, " M"]  # row of each lane's first vertex, and the number of vertices: M = N + 1
     xyz: Float[np.ndarray, "V 3"]  # vertices, lane after lane
     arc: Float[np.ndarray, " V"]  # length along the lane up to each vertex
-    shift: Float[np.ndarray, " N"]  # with which lengths along lanes increase over all lanes: one search finds all segments
+    shift: Float[np.ndarray, " N"]  # with which lengths increase over all lanes, so that one search finds all segments
+    increasing: Float[np.ndarray, " V"]  # `arc` with it
 
 
 class LaneProjections(NamedTuple):
@@ -62,7 +63,7 @@ def make(roads: Sequence[Polyline]) -> LaneGraph:
 
     ids, length = np.array([line.id for line in lanes], int), arc[first[1:] - 1]
     shift = np.concatenate([[0.0], np.cumsum(length + 1.0)])[:-1]
-    return LaneGraph(ids, length, links("exit"), links("left"), links("right"), first, xyz, arc, shift)
+    return LaneGraph(ids, length, links("exit"), links("left"), links("right"), first, xyz, arc, shift, arc + np.repeat(shift, np.diff(first)))
 
 
 def point_at(
@@ -70,8 +71,7 @@ def point_at(
 ) -> tuple[Float[np.ndarray, "K 3"], Float[np.ndarray, "K 2"]]:
     """Points and unit directions at lengths along lanes; lengths beyond an end give the end."""
     arc = np.clip(arc, 0.0, lanes.length[lane])
-    increasing = lanes.arc + np.repeat(lanes.shift, np.diff(lanes.first))
-    segment = np.searchsorted(increasing, arc + lanes.shift[lane], side="right") - 1
+    segment = np.searchsorted(lanes.increasing, arc + lanes.shift[lane], side="right") - 1
     segment = np.clip(segment, lanes.first[lane], lanes.first[lane + 1] - 2)
     step = lanes.arc[segment + 1] - lanes.arc[segment]
     fraction = ((arc - lanes.arc[segment]) / step)[:, None]
