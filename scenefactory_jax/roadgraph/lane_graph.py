@@ -63,7 +63,8 @@ def make(roads: Sequence[Polyline]) -> LaneGraph:
 
     ids, length = np.array([line.id for line in lanes], int), arc[first[1:] - 1]
     shift = np.concatenate([[0.0], np.cumsum(length + 1.0)])[:-1]
-    return LaneGraph(ids, length, links("exit"), links("left"), links("right"), first, xyz, arc, shift, arc + np.repeat(shift, np.diff(first)))
+    increasing = arc + np.repeat(shift, np.diff(first))
+    return LaneGraph(ids, length, links("exit"), links("left"), links("right"), first, xyz, arc, shift, increasing)
 
 
 def point_at(
