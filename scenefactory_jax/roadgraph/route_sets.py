@@ -150,7 +150,7 @@ def _measure_offsets(lanes: LaneMap, chains: list[tuple[int, ...]], track: Float
         nearest[member] = np.maximum(nearest[member], most[member].min(axis=0))
     lane, point = np.nonzero(least <= nearest)
     distance = np.full(most.shape, np.inf)
-    distance[lane, point] = shapely.distance(lanes.shapes[rows[lane]], shapely.points(track)[point])
+    distance[lane, point] = shapely.distance(lanes.shapes[rows[lane]], np.asarray(shapely.points(track))[point])
     return [distance[member].min(axis=0) for member in members]
 
 
