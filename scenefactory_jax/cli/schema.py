@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 from typing import Annotated, Any, Literal
 
 from scenefactory_jax.cli.hydra_config import find_conf
+from scenefactory_jax.core.distributed import Distributed
 from scenefactory_jax.core.schema import Bounds, ConfigError, Count, NonNegative, Positive, Seed, check
 from scenefactory_jax.evaluation.metrics.agent_metrics import METRICS
 from scenefactory_jax.evaluation.settings import Episodes, Failures, ScoreSettings, Video
@@ -100,6 +101,7 @@ class Train(Task):
     seed: Seed
     worlds: Count
     devices: Count | None
+    distributed: Distributed
     iterations: Count
     minutes: NonNegative | None
     checkpoint_every: Count
@@ -347,11 +349,7 @@ def _check_seeds(seeds: list[int] | None) -> None:
 
 
 def check_terminations(names: list[str], *, where: str) -> None:
-    """Checks that protocols are options of the group `termination`.
-
-    Raises:
-        ConfigError: no or an unknown protocol.
-    """
+    """Checks that protocols are options of the group `termination`; ConfigError for none or an unknown one."""
     valid = sorted(path.stem for path in (find_conf() / "termination").glob("*.yaml"))
     if not names or not set(names) <= set(valid):
         raise ConfigError(f"{where}: expected one or more of {', '.join(valid)}, got {names}")

@@ -5,6 +5,8 @@ from typing import Any
 
 from scenefactory_jax.cli import evaluate as evaluation
 from scenefactory_jax.cli import schema
+from scenefactory_jax.core import distributed
+from scenefactory_jax.core.schema import read
 from scenefactory_jax.data.loading import scene_source
 from scenefactory_jax.learning import training_loop
 from scenefactory_jax.learning.training_loop import OnIteration, Prepared, Run
@@ -32,4 +34,5 @@ def train(config: dict[str, Any], *, on_iteration: OnIteration | None = None, pr
         else:
             finish = lambda folder: print(NO_REPORT, flush=True)  # noqa: E731
     callback = functools.partial(evaluation.make_training_callback, config)
-    return training_loop.train(config, on_iteration=on_iteration, prepared=prepared, make_callback=callback, finish=finish)
+    with distributed.join(read(config["distributed"], distributed.Distributed, where="distributed")):
+        return training_loop.train(config, on_iteration=on_iteration, prepared=prepared, make_callback=callback, finish=finish)

@@ -71,7 +71,11 @@ def sample_tracks(logs: Logs, times: Float[np.ndarray, " L"], samples: Float[np.
 
 def join_lines(lines: Sequence[Polyline]) -> Points:
     """Joins the points of polylines."""
-    xyz = [line.xyz for line in lines]
+    return join_points([line.xyz for line in lines])
+
+
+def join_points(xyz: Sequence[Float[np.ndarray, "_ 3"]]) -> Points:
+    """Joins the points of lines."""
     return Points(np.concatenate([*xyz, np.zeros((0, 3))]), np.cumsum([0, *map(len, xyz)]))
 
 

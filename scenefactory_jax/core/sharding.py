@@ -9,7 +9,7 @@ from typing import Any, TypeVar
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.sharding import Mesh, NamedSharding, PartitionSpec
+from jax.sharding import Mesh, NamedSharding, PartitionSpec, Sharding
 from jaxtyping import Array, Int, Key, PRNGKeyArray
 
 from scenefactory_jax.core.instantiate import ConfigError
@@ -102,11 +102,13 @@ def make_mesh(count: int | None = None) -> Mesh | None:
     """Makes a mesh of the first `count` devices of all processes (None: all); None for a single device.
 
     Raises:
-        ConfigError: more devices than there are.
+        ConfigError: more devices than there are, or of several processes not all.
     """
     devices = jax.devices()
     if count is not None and not 1 <= count <= len(devices):
         raise ConfigError(f"devices: {count}; there are {len(devices)} ({devices[0].device_kind})")
+    if count not in (None, len(devices)) and jax.process_count() > 1:
+        raise ConfigError(f"devices: expected null, all {len(devices)} of {jax.process_count()} processes, got {count}")
     chosen = devices[:count]
     return Mesh(np.array(chosen), (AXIS,)) if len(chosen) > 1 else None
 
@@ -115,10 +117,26 @@ def place_on_devices(scenes: Tree, mesh: Mesh | None) -> Tree:
     """Places arrays on the devices, divided along their first axis; every process has all arrays and places its part."""
     if mesh is None:
         return jax.device_put(scenes)
+    # `jit` returns empty arrays replicated: placed otherwise, they would make the next program compile twice
+    spec = lambda leaf: PartitionSpec(AXIS) if leaf.size else PartitionSpec()  # noqa: E731
+    return jax.tree.map(lambda leaf: place(np.asarray(leaf), NamedSharding(mesh, spec(leaf))), scenes)
 
-    def put(leaf: np.ndarray) -> jax.Array:
-        # `jit` returns empty arrays replicated: placed otherwise, they would make the next program compile twice
-        sharding = NamedSharding(mesh, PartitionSpec(AXIS) if leaf.size else PartitionSpec())
-        return jax.make_array_from_callback(leaf.shape, sharding, lambda part: np.asarray(leaf)[part])
 
-    return jax.tree.map(put, scenes)
+def place(value: np.ndarray, to: Sharding) -> jax.Array:
+    """Places an array that every process has; each places the part of its devices."""
+    return jax.make_array_from_callback(value.shape, to, lambda part: value[part])
+
+
+def fetch(tree: Any) -> Any:
+    """Copies arrays to the host, in every process; parts on devices of other processes are gathered, one array after the other."""
+    if jax.process_count() == 1:
+        return jax.device_get(tree)
+    return jax.tree.map(lambda leaf: np.asarray(leaf if leaf.is_fully_addressable else _gather(leaf)), tree)
+
+
+def _gather(leaf: Array) -> Array:
+    if leaf.is_fully_replicated:
+        return leaf
+    assert isinstance(leaf.sharding, NamedSharding)
+    everywhere = NamedSharding(leaf.sharding.mesh, PartitionSpec())
+    return jax.jit(lambda x: x, out_shardings=everywhere)(leaf)

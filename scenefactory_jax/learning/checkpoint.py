@@ -16,6 +16,7 @@ import numpy as np
 from flax.traverse_util import unflatten_dict
 from jaxtyping import Array
 
+from scenefactory_jax.core import distributed, sharding
 from scenefactory_jax.core.atomic_file import write_atomically
 from scenefactory_jax.core.schema import ConfigError
 
@@ -28,6 +29,8 @@ Arrays = dict[str, np.ndarray]
 def save(folder: Path | str, train_state: Any, *, keep: int, host: Mapping[str, Any] | None = None) -> Path:
     """Writes a train state under its iteration's number and keeps the `keep` newest checkpoints of the folder.
 
+    Of several processes all call it; the first one writes, and the others wait for it.
+
     Args:
         host: plain JSON values to save with it.
 
@@ -38,7 +41,10 @@ def save(folder: Path | str, train_state: Any, *, keep: int, host: Mapping[str, 
     if keep < 1:
         raise ConfigError(f"keep: expected an integer >= 1, got {keep}")
     file = _path(folder, int(train_state.iteration))
-    arrays: Arrays = jax.device_get({name: _to_data(leaf) for name, leaf in _name_leaves(train_state).items() if leaf.size})
+    arrays: Arrays = sharding.fetch({name: _to_data(leaf) for name, leaf in _name_leaves(train_state).items() if leaf.size})
+    if not distributed.is_first():
+        distributed.share(f"saved/{file.stem}", lambda: None)
+        return file
     arrays |= {} if host is None else {HOST: np.array(json.dumps(host))}
     file.parent.mkdir(parents=True, exist_ok=True)
     try:
@@ -50,6 +56,7 @@ def save(folder: Path | str, train_state: Any, *, keep: int, host: Mapping[str, 
         raise OSError(error.errno, f"{error.strerror}; {hint}", str(file)) from None
     for old in _list_iterations(folder)[:-keep]:
         _path(folder, old).unlink()
+    distributed.share(f"saved/{file.stem}", lambda: None)
     return file
 
 
@@ -189,5 +196,5 @@ def _place(value: np.ndarray | None, leaf: Array) -> Array:
     """Places a value on the devices of `leaf`. It is bound to a device only if `leaf` is: otherwise a resumed run compiles again."""
     if value is None:
         return jnp.copy(leaf)  # an empty array, as a buffer of its own: donating one does not delete the other
-    placed = jax.device_put(value, leaf.sharding) if leaf.committed else jax.device_put(value, may_alias=False)
+    placed = sharding.place(value, leaf.sharding) if leaf.committed else jax.device_put(value, may_alias=False)
     return jax.random.wrap_key_data(placed, impl=jax.random.key_impl(leaf)) if leaf.dtype != value.dtype else placed

@@ -11,7 +11,9 @@ from scenefactory_jax.core import sharding
 from scenefactory_jax.core.pytree import pytree_dataclass, tree_where
 from scenefactory_jax.core.types import Env, Observation, Policy, Scene, State, StepResult
 from scenefactory_jax.env import environment
+from scenefactory_jax.learning import replay_buffer
 from scenefactory_jax.learning.gaussian import log_probability
+from scenefactory_jax.learning.replay_buffer import Storage
 
 
 @pytree_dataclass
@@ -87,7 +89,16 @@ Counts = dict[str, Array]
 
 
 def collect_rollout(
-    env: Env, policy: Policy, parameters: Any, scenes: Scene, worlds: Worlds, key: PRNGKeyArray, *, horizon: int, axis: str | None = None
+    env: Env,
+    policy: Policy,
+    parameters: Any,
+    scenes: Scene,
+    worlds: Worlds,
+    key: PRNGKeyArray,
+    *,
+    horizon: int,
+    storage: Storage = "float32",
+    axis: str | None = None,
 ) -> tuple[Worlds, Sample, Counts, SceneStats]:
     """Acts `horizon` times in `W` worlds; a world that is done restarts with a new key before it is observed.
 
@@ -95,14 +106,17 @@ def collect_rollout(
     steps, and the counts of each world.
 
     Args:
+        storage: type of the observations in samples, as which the policy sees them.
         axis: mesh axis of the devices that share the worlds, see `sharding`.
     """
 
     def step(worlds: Worlds, key: PRNGKeyArray) -> tuple[Worlds, tuple[Sample, Counts]]:
         action_key, start_key = jax.random.split(key)
-        mean, log_std, value = policy.apply(parameters, worlds.observation)
-        action = mean + jnp.exp(log_std) * sample_noise(action_key, mean, axis)
         observation, position = worlds.observation, worlds.state.motion.position[..., :2]
+        if storage != "float32":
+            observation = replay_buffer.compress(observation, storage)
+        mean, log_std, value = policy.apply(parameters, replay_buffer.expand(observation))
+        action = mean + jnp.exp(log_std) * sample_noise(action_key, mean, axis)
         worlds, outcome, counts = step_worlds(env, scenes, worlds, action, start_key, axis=axis)
         density = log_probability(action, mean, log_std)
         return worlds, (Sample(observation, action, mean, density, value, **vars(outcome), position=position), counts)

@@ -3,6 +3,7 @@
 import contextlib
 import datetime
 import itertools
+import json
 import logging
 import re
 import zlib
@@ -11,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from scenefactory_jax.core import config as configs
-from scenefactory_jax.core import folder_lock
+from scenefactory_jax.core import distributed, folder_lock
 from scenefactory_jax.core.config import find_differences
 from scenefactory_jax.core.instantiate import ConfigError
 from scenefactory_jax.learning import checkpoint
@@ -20,20 +21,38 @@ LOG = logging.getLogger(__name__)
 MAX_LETTERS = 80  # of a sweep's changes in the name of a folder
 # Keys that may change when a run is resumed, with all below them
 FREE = ("out", "resume", "progress", "name", "iterations", "minutes", "checkpoint_every", "checkpoints_kept", "devices", "scenes.workers")
-FREE += ("loggers", "evaluation", "scenes.heldout")
+FREE += ("loggers", "evaluation", "scenes.heldout", "distributed")
 
 
 @contextlib.contextmanager
 def open_run_folder(config: Mapping[str, Any]) -> Iterator[tuple[Path, bool]]:
     """Opens and locks the run's folder; gives it, and whether it has a checkpoint to resume from.
 
+    Of several processes the first one does so, and the others use its folder.
+
     Raises:
-        ConfigError: the folder has a run already, or for `resume` none, or one of other settings; or another command trains there.
+        ConfigError: the folder has a run already, or for `resume` none, or one of other settings; or another command trains there; or a
+            process that does not see the first one's folder, or has other settings.
     """
+    if not distributed.is_first():
+        yield _use_folder_of_first(config)
+        return
     if config["resume"] and config["out"] is None:
         raise ConfigError("resume=true needs out=RUN_DIR: the folder to go on in")
     with _make_folder(config) as folder, folder_lock.lock_folder(folder):
-        yield folder, _find_resumable(folder, config)
+        resumable = _find_resumable(folder, config)
+        distributed.share("run", lambda: [str(folder.resolve()), resumable, config])
+        yield folder, resumable
+
+
+def _use_folder_of_first(config: Mapping[str, Any]) -> tuple[Path, bool]:
+    folder, resumable, settings = distributed.share("run", lambda: None)
+    if not Path(folder).is_dir():
+        raise ConfigError(f"out: {folder} of the first process is not there on this host; give a folder that all hosts share")
+    differ = find_differences(settings, json.loads(json.dumps(config)))
+    if keys := [key for key in differ if not key.startswith("distributed.")]:
+        raise ConfigError(f"{', '.join(keys[:4])}: expected the settings of the first process; start all processes with the same command")
+    return Path(folder), resumable
 
 
 def make_folder_name(name: str, changes: Sequence[str] = ()) -> Path:

@@ -13,7 +13,7 @@ from jax.sharding import Mesh
 
 from scenefactory_jax import loggers
 from scenefactory_jax.core import config as configs
-from scenefactory_jax.core import sharding
+from scenefactory_jax.core import distributed, sharding
 from scenefactory_jax.core.instantiate import ConfigError, instantiate, resolve_target
 from scenefactory_jax.core.types import Env, Policy, Scene
 from scenefactory_jax.data.loading import scene_source, stream
@@ -102,24 +102,26 @@ def train(
     watching = loggers.make(config["loggers"])
     scene_source.use_compilation_cache()
     prepared = prepared or prepare(config)
+    trainer = Trainer(*(distributed.compile_together(name, part) for name, part in prepared.trainer._asdict().items()))
     with run_folder.open_run_folder(config) as (folder, resume):
         with contextlib.ExitStack() as stack:
             before = checkpoint.restore_host(folder / "checkpoints") if resume else None
             worlds, flow = stack.enter_context(_open_scenes(config, folder, prepared, before))
-            state = prepared.trainer.init(jax.random.key(config["seed"]), worlds)
+            state = trainer.init(jax.random.key(config["seed"]), worlds)
             if resume:
                 state = checkpoint.restore(folder / "checkpoints", state)
                 LOG.info(f"resumed at iteration {int(state.iteration)}")
             before = before and before.get("samples")
-            samples = stack.enter_context(sample_stream.open_stream(config, prepared.trainer, state, mesh=prepared.mesh, before=before))
+            samples = stack.enter_context(sample_stream.open_stream(config, trainer, state, mesh=prepared.mesh, before=before))
             first = int(state.iteration) if resume else None
-            configs.write(folder, config)  # once scenes and checkpoint are read: a failed start leaves no config
             callbacks = [on_iteration] if on_iteration else []
-            if callback := make_callback and make_callback(folder, first):
+            if distributed.is_first():
+                configs.write(folder, config)  # once scenes and checkpoint are read: a failed start leaves no config
+            if callback := make_callback and distributed.is_first() and make_callback(folder, first):
                 callbacks.insert(0, lambda state, row: callback(get_policy_parameters(state), row))
             streams = Streams(flow, samples)
-            state = _loop(config, folder, prepared.trainer, worlds, state, streams, watching, first=first, callbacks=callbacks)
-        if finish is not None:
+            state = _loop(config, folder, trainer, worlds, state, streams, watching, first=first, callbacks=callbacks)
+        if finish is not None and distributed.is_first():
             finish(folder)
     return Run(folder, config, prepared.env, prepared.policy, state, metrics_csv.read(folder))
 
@@ -182,19 +184,21 @@ def _loop(
 ) -> TrainState:
     """Iterates until `iterations` or `minutes` is reached; every row is written to metrics.csv before the next iteration starts.
 
+    Of several processes the first one writes, and all end after the same iteration.
+
     `minutes` counts iterations, compilation included, not checkpoints or evaluations. A signal ends the loop after the current iteration,
     with a checkpoint.
 
     Args:
         first: iteration that the run resumes at; None: a new run.
     """
-    total, start = config["iterations"], first or 0
-    file = metrics_csv.MetricsFile(folder, resume_at=first)
-    spent, years = (file.rows[-1].get(name, 0.0) if file.rows else 0.0 for name in ("minutes", "years"))
+    total, start, writes = config["iterations"], first or 0, distributed.is_first()
+    file = metrics_csv.MetricsFile(folder, resume_at=first) if writes else None
+    spent, years = (file.rows[-1].get(name, 0.0) if file and file.rows else 0.0 for name in ("minutes", "years"))
     with (
         interrupt.defer_interrupt() as get_signal,
-        loggers.open_loggers(watching, folder, config, after=start) as log,
-        metrics_csv.progress(total, enable=config["progress"], start=start) as show,
+        loggers.open_loggers(watching if writes else {}, folder, config, after=start) as log,
+        metrics_csv.progress(total, enable=config["progress"] and writes, start=start) as show,
     ):
         for iteration in range(start + 1, total + 1):
             before = time.monotonic()
@@ -206,13 +210,15 @@ def _loop(
             row |= count_years(row, years, control_hz=config["timing"]["control_hz"])
             years = row["years"]
             row |= {f"{name}_per_s": row[f"steps/{name}"] / seconds for name in ("updates", "samples") if f"steps/{name}" in row}
-            file.add(row)
+            if file is not None:
+                file.add(row)
             log(row)
             show(iteration, describe(row))
             check_finite(row)
             for callback in callbacks:
                 callback(state, row)
-            late, stop = config["minutes"] is not None and spent >= config["minutes"], get_signal()
+            late = config["minutes"] is not None and spent >= config["minutes"]
+            late, stop = distributed.share_stop(iteration, late=late, signal=get_signal())
             if late or stop or iteration == total or iteration % config["checkpoint_every"] == 0:
                 checkpoint.save(folder / "checkpoints", state, keep=config["checkpoints_kept"], host=streams.state())
             if stop:

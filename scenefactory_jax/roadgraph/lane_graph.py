@@ -8,6 +8,7 @@ import shapely
 from jaxtyping import Float, Int
 
 from scenefactory_jax.core.raw_scene import Polyline
+from scenefactory_jax.core.scene_arrays import join_lines
 from scenefactory_jax.core.types import DRIVABLE
 
 LanePairs = Int[np.ndarray, "E 2"]  # rows of lanes, from and to
@@ -24,6 +25,8 @@ class LaneGraph(NamedTuple):
     first: Int[np.ndarray, " M"]  # row of each lane's first vertex, and the number of vertices: M = N + 1
     xyz: Float[np.ndarray, "V 3"]  # vertices, lane after lane
     arc: Float[np.ndarray, " V"]  # length along the lane up to each vertex
+    shift: Float[np.ndarray, " N"]  # with which lengths increase over all lanes, so that one search finds all segments
+    increasing: Float[np.ndarray, " V"]  # `arc` with it
 
 
 class LaneProjections(NamedTuple):
@@ -39,15 +42,15 @@ class LaneProjections(NamedTuple):
 
 def make(roads: Sequence[Polyline]) -> LaneGraph:
     """Builds the graph of the lanes for cars of a map. Links to lanes that are not on the map are left out."""
-    lanes = []
-    for line in roads:
-        if line.kind in DRIVABLE:
-            new = np.concatenate([[True], np.diff(line.xyz[:, :2], axis=0).any(axis=1)])[: len(line.xyz)]
-            if new.sum() > 1:
-                lanes.append((line, line.xyz[new]))
-    row = {line.id: number for number, (line, _) in enumerate(lanes)}
-    first = np.cumsum([0, *(len(xyz) for _, xyz in lanes)])
-    xyz = np.concatenate([np.zeros((0, 3)), *(xyz for _, xyz in lanes)])
+    joined = join_lines(lines := [line for line in roads if line.kind in DRIVABLE])
+    new = np.ones(len(joined.xyz), bool)  # vertices that differ from the one before
+    new[1:] = (joined.xyz[1:, :2] != joined.xyz[:-1, :2]).any(axis=1)
+    new[joined.bounds[:-1][np.diff(joined.bounds) > 0]] = True
+    counts = np.diff(np.concatenate([[0], np.cumsum(new)])[joined.bounds])
+    lanes = [line for line, count in zip(lines, counts.tolist(), strict=True) if count > 1]
+    row = {line.id: number for number, line in enumerate(lanes)}
+    first = np.concatenate([[0], np.cumsum(counts[counts > 1])])
+    xyz = joined.xyz[new & np.repeat(counts > 1, np.diff(joined.bounds))]
     step = np.zeros(len(xyz))
     step[1:] = np.linalg.norm(np.diff(xyz[:, :2], axis=0), axis=1)
     step[first[:-1]] = 0.0
@@ -55,11 +58,13 @@ def make(roads: Sequence[Polyline]) -> LaneGraph:
     arc = total - np.repeat(total[first[:-1]], np.diff(first))
 
     def links(relation: str) -> LanePairs:
-        pairs = [(row[line.id], row[other]) for line, _ in lanes for other in getattr(line, relation) if other in row]
+        pairs = [(row[line.id], row[other]) for line in lanes for other in getattr(line, relation) if other in row]
         return np.array(pairs, int).reshape(-1, 2)
 
-    ids = np.array([line.id for line, _ in lanes], int)
-    return LaneGraph(ids, arc[first[1:] - 1], links("exit"), links("left"), links("right"), first, xyz, arc)
+    ids, length = np.array([line.id for line in lanes], int), arc[first[1:] - 1]
+    shift = np.concatenate([[0.0], np.cumsum(length + 1.0)])[:-1]
+    increasing = arc + np.repeat(shift, np.diff(first))
+    return LaneGraph(ids, length, links("exit"), links("left"), links("right"), first, xyz, arc, shift, increasing)
 
 
 def point_at(
@@ -67,10 +72,7 @@ def point_at(
 ) -> tuple[Float[np.ndarray, "K 3"], Float[np.ndarray, "K 2"]]:
     """Points and unit directions at lengths along lanes; lengths beyond an end give the end."""
     arc = np.clip(arc, 0.0, lanes.length[lane])
-    # one search finds all segments, because the shift makes lengths increase over all lanes
-    shift = np.concatenate([[0.0], np.cumsum(lanes.length + 1.0)])[:-1]
-    increasing = lanes.arc + np.repeat(shift, np.diff(lanes.first))
-    segment = np.searchsorted(increasing, arc + shift[lane], side="right") - 1
+    segment = np.searchsorted(lanes.increasing, arc + lanes.shift[lane], side="right") - 1
     segment = np.clip(segment, lanes.first[lane], lanes.first[lane + 1] - 2)
     step = lanes.arc[segment + 1] - lanes.arc[segment]
     fraction = ((arc - lanes.arc[segment]) / step)[:, None]

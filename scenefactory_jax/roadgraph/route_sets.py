@@ -12,6 +12,7 @@ import numpy as np
 import shapely
 from jaxtyping import Float, Int
 
+from scenefactory_jax.core.scene_arrays import segment_lengths
 from scenefactory_jax.core.types import ROUTE_SPACING_M
 from scenefactory_jax.roadgraph import lane_graph
 from scenefactory_jax.roadgraph.lane_graph import LaneGraph
@@ -19,6 +20,8 @@ from scenefactory_jax.roadgraph.lane_graph import LaneGraph
 ROOT_RADIUS_M = (2.5, 5.0)  # of the lanes at which routes begin: the second if there is none within the first
 ROOT_COSINE = 0.5  # between lane and car
 MAX_LANES = 10  # of a chain
+BOUND_SLACK_M = 1e-6  # far above the rounding of a distance
+STRIDE = 4  # vertices of a lane of which one is looked at first
 MAX_CHAINS = 400  # from one root: at the largest junctions chains of later branches are left out
 
 
@@ -40,6 +43,9 @@ class LaneMap(NamedTuple):
     successors: tuple[tuple[int, ...], ...]
     shapes: np.ndarray  # shapely's lines
     tree: shapely.STRtree
+    few: Int[np.ndarray, " K"]  # every STRIDE-th vertex of each lane and its last one, lane after lane
+    first_few: Int[np.ndarray, " M"]  # row in `few` of each lane's first one, and the number of rows
+    gap_m: Float[np.ndarray, " N"]  # longest way along each lane between two of them
 
 
 def make_lane_map(graph: LaneGraph) -> LaneMap:
@@ -48,7 +54,13 @@ def make_lane_map(graph: LaneGraph) -> LaneMap:
     for lane, successor in graph.successor.tolist():
         following[lane].append(successor)
     shapes = lane_graph.lane_shapes(graph)
-    return LaneMap(graph, tuple(tuple(sorted(set(rows))) for rows in following), shapes, shapely.STRtree(shapes))
+    owner = np.repeat(np.arange(len(graph.id)), np.diff(graph.first))
+    place = np.arange(len(owner)) - graph.first[owner]
+    few = np.flatnonzero((place % STRIDE == 0) | (place + 1 == np.diff(graph.first)[owner]))
+    gap = np.zeros(len(graph.id))
+    np.maximum.at(gap, owner[few[1:]], np.where(owner[few[1:]] == owner[few[:-1]], graph.arc[few[1:]] - graph.arc[few[:-1]], 0.0))
+    successors = tuple(tuple(sorted(set(rows))) for rows in following)
+    return LaneMap(graph, successors, shapes, shapely.STRtree(shapes), few, np.searchsorted(owner[few], np.arange(len(graph.id) + 1)), gap)
 
 
 def find_track_routes(
@@ -69,8 +81,7 @@ def find_track_routes(
     kept = _drop_parts(chains)
     if not kept:
         return [sample_track(track, max_length_m)]
-    distance = _measure_distances(lanes, sorted({lane for chain in kept for lane in chain}), track)
-    offsets = [np.min([distance[lane] for lane in chain], axis=0) for chain in kept]
+    offsets = _measure_offsets(lanes, kept, track)
     order = sorted(range(len(kept)), key=lambda place: float(offsets[place].sum()))[:count]
     if offsets[order[0]].max() > max_distance_m:
         return [sample_track(track, max_length_m)]
@@ -120,10 +131,27 @@ def _drop_parts(chains: list[tuple[int, ...]]) -> list[tuple[int, ...]]:
     return [chain for bits, chain in kept.items() if not any(bits & other == bits and bits != other for other in kept)]
 
 
-def _measure_distances(lanes: LaneMap, rows: list[int], track: Float[np.ndarray, "L 2"]) -> dict[int, Float[np.ndarray, " L"]]:
-    """Distances of a track's points from each of these lanes."""
-    points = shapely.points(track)
-    return {row: np.asarray(shapely.distance(lanes.shapes[row], points)) for row in rows}
+def _measure_offsets(lanes: LaneMap, chains: list[tuple[int, ...]], track: Float[np.ndarray, "L 2"]) -> list[Float[np.ndarray, " L"]]:
+    """Distances of a track's points from each chain.
+
+    Distances from few vertices bound those from the lanes, and tell which lanes may be the nearest of a chain; only these are measured.
+    """
+    rows = np.array(sorted({lane for chain in chains for lane in chain}))
+    counts = lanes.first_few[rows + 1] - lanes.first_few[rows]
+    starts = np.cumsum(counts) - counts
+    few = lanes.graph.xyz[lanes.few[np.repeat(lanes.first_few[rows] - starts, counts) + np.arange(counts.sum())]]
+    squared = np.square(few[:, 0, None] - track[:, 0]) + np.square(few[:, 1, None] - track[:, 1])
+    most = np.sqrt(np.minimum.reduceat(squared, starts, axis=0))
+    least = most - lanes.gap_m[rows, None] / 2 - BOUND_SLACK_M
+    row = {lane: place for place, lane in enumerate(rows.tolist())}
+    members = [[row[lane] for lane in chain] for chain in chains]
+    nearest = np.full(most.shape, -np.inf)
+    for member in members:
+        nearest[member] = np.maximum(nearest[member], most[member].min(axis=0))
+    lane, point = np.nonzero(least <= nearest)
+    distance = np.full(most.shape, np.inf)
+    distance[lane, point] = shapely.distance(lanes.shapes[rows[lane]], np.asarray(shapely.points(track))[point])
+    return [distance[member].min(axis=0) for member in members]
 
 
 def sample_chain(lanes: LaneMap, chain: tuple[int, ...], start: Float[np.ndarray, "2"], max_length_m: float) -> SampledRoute:
@@ -137,15 +165,26 @@ def sample_lanes(lanes: LaneMap, chain: tuple[int, ...], behind: float, max_leng
     graph = lanes.graph
     pieces, owners = [], []
     for place, lane in enumerate(chain):
-        line = graph.xyz[graph.first[lane] : graph.first[lane + 1], :2]
-        arc = graph.arc[graph.first[lane] : graph.first[lane + 1]]
+        line, arc = _take_lane(graph, lane)
         if place == 0:
-            first = lane_graph.point_at(graph, np.array([lane]), np.array([behind]))[0][:, :2]
-            line = np.concatenate([first, line[arc > behind]])
+            line = np.concatenate([_point_on(line, arc, behind)[None], line[arc > behind]])
         pieces.append(line)
         owners.append(np.full(len(line), lane))
     xy, length, nearest = resample(np.concatenate(pieces), max_length_m)
     return SampledRoute(xy, np.concatenate(owners)[nearest], length, chain, on_route=False, along_lanes=True)
+
+
+def _take_lane(graph: LaneGraph, lane: int) -> tuple[Float[np.ndarray, "V 2"], Float[np.ndarray, " V"]]:
+    """The vertices of one lane, and the length along it up to each."""
+    rows = slice(graph.first[lane], graph.first[lane + 1])
+    return graph.xyz[rows, :2], graph.arc[rows]
+
+
+def _point_on(line: Float[np.ndarray, "V 2"], arc: Float[np.ndarray, " V"], at: float) -> Float[np.ndarray, "2"]:
+    """The point at a length along one lane, as `lane_graph.point_at` computes it for many."""
+    at = min(max(at, 0.0), arc[-1])
+    segment = min(int(np.searchsorted(arc, at, side="right")) - 1, len(arc) - 2)
+    return line[segment] + (at - arc[segment]) / (arc[segment + 1] - arc[segment]) * (line[segment + 1] - line[segment])
 
 
 def sample_track(track: Float[np.ndarray, "L 2"], max_length_m: float) -> SampledRoute:
@@ -156,15 +195,20 @@ def sample_track(track: Float[np.ndarray, "L 2"], max_length_m: float) -> Sample
 
 def resample(line: Float[np.ndarray, "V 2"], max_length_m: float) -> tuple[Float[np.ndarray, "N 2"], float, Int[np.ndarray, " N"]]:
     """Points every ROUTE_SPACING_M along a line and its end, the length, and the vertex at or after each point."""
-    step = np.linalg.norm(np.diff(line, axis=0), axis=1)
-    line = line[np.concatenate([[True], step > 1e-3])]
-    used = np.flatnonzero(np.concatenate([[True], step > 1e-3]))
-    arc = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(line, axis=0), axis=1))])
+    step = segment_lengths(line[1:] - line[:-1])
+    used = np.concatenate([[0], 1 + np.flatnonzero(step > 1e-3)])
+    if len(used) < len(line):
+        line = line[used]
+        step = segment_lengths(line[1:] - line[:-1])
+    arc = np.zeros(len(line))
+    np.cumsum(step, out=arc[1:])
     length = min(float(arc[-1]), max_length_m)
     places = np.append(np.arange(0.0, length, ROUTE_SPACING_M), length)
     if len(places) > 1 and places[-1] - places[-2] < 1e-3:
         places = np.delete(places, -2)
-    xy = np.stack([np.interp(places, arc, line[:, axis]) for axis in (0, 1)], axis=1)
+    xy = np.empty((len(places), 2))
+    for axis in (0, 1):
+        xy[:, axis] = np.interp(places, arc, line[:, axis])
     return xy, length, used[np.minimum(np.searchsorted(arc, places), len(arc) - 1)]
 
 
@@ -191,15 +235,18 @@ def draw_routes(
     winding, straight = list[SampledRoute](), list[SampledRoute]()
     if not len(graph.id):
         return []
-    chance = graph.length / graph.length.sum()
+    chance = np.cumsum(graph.length / graph.length.sum())
+    chance /= chance[-1]
     most_winding = round(count * turn_fraction)
-    for _ in range(attempts):
-        lane = int(rng.choice(len(chance), p=chance))
+    for _ in range(attempts):  # the draws are those of `rng.choice`, which checks its arguments each time
+        lane = int(np.searchsorted(chance, rng.random(), side="right"))
         behind = float(rng.uniform(0.0, graph.length[lane]))
         chain, length = [lane], float(graph.length[lane]) - behind
         while length < length_m[1] and (further := [row for row in lanes.successors[chain[-1]] if row not in chain]):
-            chain.append(int(rng.choice(further)))
+            chain.append(further[int(rng.integers(0, len(further)))])
             length += float(graph.length[chain[-1]])
+        if np.abs(_point_on(*_take_lane(graph, lane), behind) - centre).max() > half_m:
+            continue  # it begins outside
         route = cut_to_square(sample_lanes(lanes, tuple(chain), behind, length_m[1]), centre, half_m)
         if route is not None and route.length >= length_m[0]:
             (winding if is_winding(route.xy) else straight).append(route)
@@ -211,7 +258,8 @@ def draw_routes(
 
 def cut_to_square(route: SampledRoute, centre: Float[np.ndarray, "2"], half_m: float) -> SampledRoute | None:
     """The route until it leaves a square; None if it begins outside, or is shorter than one step."""
-    outside = np.flatnonzero(np.abs(route.xy - centre).max(axis=1) > half_m)
+    away = np.abs(route.xy - centre)
+    outside = np.flatnonzero(np.maximum(away[:, 0], away[:, 1]) > half_m)
     if not len(outside):
         return route if len(route.xy) > 1 else None
     end = int(outside[0])
@@ -224,5 +272,5 @@ def is_winding(xy: Float[np.ndarray, "N 2"], *, turn_deg: float = 45.0, detour: 
     """Whether a route turns by 45 degrees or more, or is 1.15 times longer than its chord (the suite `route100`'s definition)."""
     step = np.diff(xy, axis=0)
     heading = np.unwrap(np.arctan2(step[:, 1], step[:, 0]))
-    length, chord = np.linalg.norm(step, axis=1).sum(), np.linalg.norm(xy[-1] - xy[0])
+    length, chord = segment_lengths(step).sum(), np.linalg.norm(xy[-1] - xy[0])
     return bool(np.ptp(heading) >= np.deg2rad(turn_deg) or length >= detour * chord)

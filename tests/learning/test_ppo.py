@@ -374,3 +374,17 @@ def test_probe_5_action_that_depends_on_the_observation(probes):
     np.testing.assert_allclose(look(-1.0, 1.0)[0], [-0.5, 0.5], atol=0.1)
     assert float(history[-1]["reward"]) > float(history[0]["reward"]) + 0.1
     assert float(history[-1]["ppo/left_out"]) == 0.0
+
+
+def test_a_rollout_in_float16_holds_what_the_policy_saw(course):
+    """Half the memory; a minibatch has it as float32 again."""
+    policy, env, stage = late_fusion.make(**SMALL), probe(life=5, episode_steps=4), scenes(WORLDS)
+    train_state = course[0].init(jax.random.key(0), stage)
+    collect = functools.partial(rollout.collect_rollout, env, policy, horizon=2, storage="float16")
+    _, samples, _, _ = jax.jit(collect)(train_state.parameters, stage, train_state.worlds, jax.random.key(1))
+    assert samples.observation["cue"].dtype == jnp.float16
+    ppo = PPO(env, policy, ppo_config())
+    batch = train_iteration.make_batch(ppo, samples, samples.reward, samples.value)
+    taken = loss.take_minibatch(batch, jnp.arange(len(batch.weight)))
+    assert taken.observation["cue"].dtype == jnp.float32
+    np.testing.assert_allclose(policy.apply(train_state.parameters, taken.observation)[0], taken.mean, atol=1e-6)

@@ -30,6 +30,7 @@ NUMBERS = dict(
     epochs=4,
     minibatches=4,
     sample_fraction=1.0,
+    storage="float32",
     permutation="each_epoch",
     learning_rate=3e-3,
     desired_kl=None,

@@ -24,5 +24,5 @@ def densify(line: Float[np.ndarray, "N D"], spacing_m: float) -> Float[np.ndarra
         return line
     counts = pieces.astype(int)
     start = np.repeat(np.arange(len(counts)), counts)
-    fraction = np.concatenate([np.arange(count) / count for count in counts])[:, None]
+    fraction = ((np.arange(len(start)) - (np.cumsum(counts) - counts)[start]) / counts[start])[:, None]
     return np.concatenate([line[start] + fraction * (line[start + 1] - line[start]), line[-1:]])

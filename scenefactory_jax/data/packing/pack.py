@@ -12,7 +12,7 @@ from jaxtyping import Bool, Float
 
 from scenefactory_jax.core.pytree import unchecked
 from scenefactory_jax.core.raw_scene import Polyline, RawScene, Unpackable
-from scenefactory_jax.core.scene_arrays import Logs, join_lines, segment_lengths, stack_tracks, wrap_angles
+from scenefactory_jax.core.scene_arrays import Logs, join_points, segment_lengths, stack_tracks, wrap_angles
 from scenefactory_jax.core.schema import Bounds, ConfigError, Positive
 from scenefactory_jax.core.types import DRIVABLE, POLYGONS, ROAD_USERS, Elevation, Scene
 from scenefactory_jax.data.formats.polylines import densify
@@ -210,7 +210,7 @@ def _segments(
 ) -> tuple[dict[str, np.ndarray], dict[str, int], float]:
     """Columns of `road` in storage order, the count of segments cut by reason, and the heights' range."""
     order = sorted((i for i, line in enumerate(raw.roads) if len(line.xyz) >= 2), key=lambda i: raw.roads[i].kind)  # stable
-    xyz, bounds = join_lines([_close_outline(raw.roads[i], outline_m) for i in order])
+    xyz, bounds = join_points([_close_outline(raw.roads[i], outline_m) for i in order])
     kind = np.array([raw.roads[i].kind for i in order], int)
     x, y = xyz[:, 0] - origin[0], xyz[:, 1] - origin[1]
     along_x, along_y = np.diff(x), np.diff(y)
@@ -246,14 +246,14 @@ def _segments(
     return road, cut, float(np.ptp(xyz[rows + 1, 2])) if len(rows) else 0.0
 
 
-def _close_outline(line: Polyline, outline_m: float) -> Polyline:
-    """A polygon with its side from the last point to the first, in segments of at most `outline_m`; other lines as they are."""
-    if line.kind not in POLYGONS:
-        return line
+def _close_outline(line: Polyline, outline_m: float) -> Float[np.ndarray, "N 3"]:
+    """The points of a polygon with its side from the last to the first, in segments of at most `outline_m`; of other lines as they are."""
     xyz = line.xyz
+    if line.kind not in POLYGONS:
+        return xyz
     if len(xyz) > 2 and np.hypot(*(xyz[-1, :2] - xyz[0, :2])) > DEGENERATE_M:
         xyz = np.concatenate([xyz, xyz[:1]])
-    return replace(line, xyz=densify(xyz, outline_m))
+    return densify(xyz, outline_m)
 
 
 def _choose_agents(

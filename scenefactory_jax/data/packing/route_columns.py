@@ -3,14 +3,14 @@
 import zlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Annotated, Any
+from typing import Annotated, Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Int
 
 from scenefactory_jax.core.instantiate import instantiate
 from scenefactory_jax.core.raw_scene import RawScene
-from scenefactory_jax.core.scene_arrays import Logs
+from scenefactory_jax.core.scene_arrays import Logs, segment_lengths
 from scenefactory_jax.core.schema import Bounds, Count, Fraction, NonNegative, Positive, Range
 from scenefactory_jax.core.types import DRIVABLE, ROUTE_SPACING_M
 from scenefactory_jax.roadgraph import lane_graph, route_sets
@@ -195,13 +195,13 @@ def _find_stops(columns: Mapping[str, np.ndarray], controls: Mapping[str, np.nda
     behind = round(BEHIND_M / ROUTE_SPACING_M)
     for row in range(len(position)):
         passed: list[tuple[float, int]] = []
+        line, lanes = _make_line(position[row]), set(lane[row].tolist())
         for control, governed in enumerate(controls["controls.lane"].tolist()):
-            on_lane = np.flatnonzero(lane[row] == governed)
-            if not len(on_lane):
+            if governed not in lanes:
                 continue
+            on_lane = np.flatnonzero(lane[row] == governed)
             first = max(int(on_lane[0]) - behind, 0)
-            stretch = position[row, first : int(on_lane[-1]) + 2]
-            arc, offset = _project(stretch, controls["controls.position"][control])
+            arc, offset = _project(line.take(first, int(on_lane[-1]) + 2), controls["controls.position"][control])
             arc += ROUTE_SPACING_M * first
             if offset <= distance_m and 0.0 < arc < columns["routes.length"][row]:
                 passed.append((arc, control))
@@ -214,15 +214,34 @@ def _find_stops(columns: Mapping[str, np.ndarray], controls: Mapping[str, np.nda
     return {"routes.stop_arc": arcs, "routes.stop_control": rows}
 
 
-def _project(line: Float[np.ndarray, "N 2"], point: Float[np.ndarray, "2"]) -> tuple[float, float]:
-    """Arc length of the nearest place on a line, and the distance to it."""
-    along = np.diff(line, axis=0)
-    length = np.maximum(np.linalg.norm(along, axis=1), 1e-9)
-    fraction = np.clip(np.sum((point - line[:-1]) * along, axis=1) / length**2, 0.0, 1.0)
-    distance = np.linalg.norm(line[:-1] + fraction[:, None] * along - point, axis=1)
-    best = int(np.argmin(distance)) if len(distance) else 0
-    if not len(distance):
-        return 0.0, float(np.linalg.norm(line[0] - point))
+class _Line(NamedTuple):
+    """Segments of a line, onto which points are projected."""
+
+    start: Float[np.ndarray, "S 2"]
+    along: Float[np.ndarray, "S 2"]
+    length: Float[np.ndarray, " S"]
+
+    def take(self, low: int, high: int) -> "_Line":
+        """The segments between two points of the line, by their numbers; `high`: exclusive."""
+        part = slice(low, max(high - 1, low))
+        return _Line(self.start[part], self.along[part], self.length[part])
+
+
+def _make_line(points: Float[np.ndarray, "N 2"]) -> _Line:
+    along = points[1:] - points[:-1]
+    return _Line(points[:-1], along, np.maximum(segment_lengths(along), 1e-9))
+
+
+def _project(line: _Line, point: Float[np.ndarray, "2"]) -> tuple[float, float]:
+    """Arc length of the nearest place on a line, and the distance to it; (0, inf) on a line of one point."""
+    start, along, length = line
+    if not len(length):
+        return 0.0, np.inf
+    ahead = point - start
+    inner = ahead[:, 0] * along[:, 0] + ahead[:, 1] * along[:, 1]
+    fraction = np.minimum(np.maximum(inner / length**2, 0.0), 1.0)
+    distance = segment_lengths(start + fraction[:, None] * along - point)
+    best = int(distance.argmin())
     return float(length[:best].sum() + fraction[best] * length[best]), float(distance[best])
 
 
@@ -235,18 +254,18 @@ def _place_agents(
         if not routed[index]:
             continue
         route[slot] = first[index]
-        line = columns["routes.position"][route[slot]]
+        line = _make_line(columns["routes.position"][route[slot]])
         path = logs.xyz[index, raw.current :][logs.valid[index, raw.current :], :2]
         start[slot] = _project(line, path[0])[0]
         end[slot] = _follow(line, path, start[slot])
     return {"agents.route": route, "agents.route_start": start, "agents.route_end": end}
 
 
-def _follow(line: Float[np.ndarray, "N 2"], path: Float[np.ndarray, "L 2"], arc: float) -> float:
+def _follow(line: _Line, path: Float[np.ndarray, "L 2"], arc: float) -> float:
     """Arc length at the end of a path that follows a line from `arc` on, also where the line crosses itself."""
     for point in path:
         low = max(int(arc / ROUTE_SPACING_M) - 8, 0)
-        window = line[low : low + 34]
-        if len(window) > 1:
+        window = line.take(low, low + 34)
+        if len(window.length):
             arc = ROUTE_SPACING_M * low + _project(window, point)[0]
     return arc

@@ -89,9 +89,9 @@ def stack(scenes: Sequence[Scene], *, capacity: Mapping[str, int | None]) -> tup
     for axis in [axis for axis, rows in sizes.items() if rows is None]:
         sizes[axis] = round_rows(axis, max(int(axis not in MAY_BE_EMPTY), *(_count(world, axis) for world in worlds)))
     cuts: list[CutCounts] = []
-    padded = [_fit(world, sizes, index, cuts) for index, world in enumerate(worlds)]
+    cut = [_cut(world, sizes, index, cuts) for index, world in enumerate(worlds)]
+    stacked = {name: _pad(name, [world[name] for world in cut], sizes) for name in columns.columns_of(cut[0])}
     elevation = elevation_grid.stack_elevations([scene.elevation for scene in scenes])
-    stacked = {name: np.stack([world[name] for world in padded]) for name in columns.columns_of(padded[0])}
     scene = columns.assemble_columns(Scene, stacked)
     return unchecked(Scene, **vars(scene) | {"elevation": elevation}), CutReport(len(scenes), sizes, tuple(cuts))
 
@@ -138,8 +138,8 @@ def _drop_padding(world: Leaves) -> Leaves:
     return world
 
 
-def _fit(world: Leaves, sizes: Mapping[str, int], index: int, cuts: list[CutCounts]) -> Leaves:
-    """The world with exactly these rows; absent agents are cut before present ones."""
+def _cut(world: Leaves, sizes: Mapping[str, int], index: int, cuts: list[CutCounts]) -> Leaves:
+    """The world with these rows at most; absent agents are cut before present ones."""
     for axis in ("agents", "steps", *MAY_BE_EMPTY, *columns.ROADS):
         had, rows, nearest = _count(world, axis), sizes[axis], None
         if had <= rows:
@@ -152,7 +152,7 @@ def _fit(world: Leaves, sizes: Mapping[str, int], index: int, cuts: list[CutCoun
         if had > rows:
             cuts.append(CutCounts(index, axis, had, rows, nearest))
         world = _take(world, axis, kept)
-    return {name: _pad(name, leaf, sizes) for name, leaf in world.items()}
+    return world
 
 
 def _find_nearest(world: Leaves, part: str, rows: int) -> tuple[np.ndarray, float]:
@@ -166,16 +166,15 @@ def _find_nearest(world: Leaves, part: str, rows: int) -> tuple[np.ndarray, floa
     return np.sort(order[:rows]), float(max(distance[order[rows]], 0.0))
 
 
-def _pad(name: str, leaf: np.ndarray, sizes: Mapping[str, int]) -> np.ndarray:
-    """Adds zeros and false masks behind the rows; sizes of absent cars repeat the last, because they are divisors."""
-    axes = columns.columns_of({name})[name].axes
-    missing = [(0, sizes[axis] - rows if isinstance(axis, str) else 0) for axis, rows in zip(axes, leaf.shape, strict=True)]
-    if not any(after for _, after in missing):
-        return leaf
-    if name == "agents.size":
-        return np.pad(leaf, missing, mode="edge") if len(leaf) else np.pad(leaf, missing, constant_values=1.0)
-    if name in ENDLESS:
-        return np.pad(leaf, missing, constant_values=np.inf)
-    if name == "routes.position" and leaf.shape[1]:  # the points behind a route's end repeat it
-        return np.pad(np.pad(leaf, [(0, 0), missing[1], (0, 0)], mode="edge"), [missing[0], (0, 0), (0, 0)])
-    return np.pad(leaf, missing)
+def _pad(name: str, leaves: Sequence[np.ndarray], sizes: Mapping[str, int]) -> np.ndarray:
+    """Stacks one column of all worlds, with zeros and false masks behind the rows; sizes of absent cars repeat the last: they divide."""
+    column = columns.columns_of({name})[name]
+    shape = (len(leaves), *(sizes[axis] if isinstance(axis, str) else axis for axis in column.axes))
+    stacked = np.full(shape, np.inf, column.dtype) if name in ENDLESS else np.zeros(shape, column.dtype)
+    for world, leaf in enumerate(leaves):
+        stacked[(world, *map(slice, leaf.shape))] = leaf
+        if name == "agents.size":
+            stacked[world, len(leaf) :] = leaf[-1] if len(leaf) else 1.0
+        elif name == "routes.position" and leaf.shape[1]:  # the points behind a route's end repeat it
+            stacked[world, : len(leaf), leaf.shape[1] :] = leaf[:, -1:]
+    return stacked

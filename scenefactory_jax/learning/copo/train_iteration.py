@@ -138,7 +138,7 @@ def compute_alignment(
     """Computes the scalar products of the global objective's gradient, at the new policy, with the gradients that the individual and the
     neighbourhood's advantages gave the old one, over one minibatch."""
     ppo = copo.ppo
-    batch, advantage = jax.tree.map(lambda x: x.at[index].get(mode="promise_in_bounds", unique_indices=True), (batch, advantage))
+    batch, advantage = loss.take_minibatch(batch, index), advantage[index]
     has_weight = batch.weight > 0.0
     average = functools.partial(partial_mean, weight=batch.weight, total=sharding.sum_over_devices(jnp.sum(batch.weight), ppo.axis))
     individual, neighbourhood, of_all = jnp.where(has_weight, advantage.T, 0.0)

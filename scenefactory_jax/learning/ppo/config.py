@@ -4,6 +4,7 @@ import dataclasses
 from typing import Annotated, Literal
 
 from scenefactory_jax.core.schema import Bounds, ConfigError, Count, Fraction, NonNegative, Positive
+from scenefactory_jax.learning.replay_buffer import Storage
 
 
 @dataclasses.dataclass(frozen=True)
@@ -14,6 +15,7 @@ class PPOConfig:
     epochs: Count  # passes over a rollout
     minibatches: Count  # gradient steps of a pass
     sample_fraction: Annotated[float, Bounds(above=0, max=1)]  # of a rollout's samples in a pass, active agents first
+    storage: Storage  # type of a rollout's observations
     shards: int | None  # groups of worlds whose samples are shuffled separately; None: one a device
     permutation: Literal["once", "each_epoch"]  # of samples to minibatches: once a rollout (RSL-RL) or in each pass
     learning_rate: float  # of Adam, at the beginning

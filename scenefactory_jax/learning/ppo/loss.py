@@ -8,12 +8,12 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
 from scenefactory_jax.core import sharding
-from scenefactory_jax.core.pytree import pytree_dataclass
+from scenefactory_jax.core.pytree import pytree_dataclass, replace
 from scenefactory_jax.core.types import Observation, Policy
-from scenefactory_jax.learning import gaussian
+from scenefactory_jax.learning import gaussian, replay_buffer
 from scenefactory_jax.learning.means import partial_mean, weighted_mean
 from scenefactory_jax.learning.ppo.config import PPOConfig
 
@@ -30,6 +30,12 @@ class Batch:
     advantage: Float[Array, " N"]
     returns: Float[Array, "N *values"]
     weight: Float[Array, " N"]
+
+
+def take_minibatch(batch: Batch, index: Int[Array, " size"]) -> Batch:
+    """Takes samples of a batch, with their observations as float32."""
+    minibatch = jax.tree.map(lambda x: x.at[index].get(mode="promise_in_bounds", unique_indices=True), batch)
+    return replace(minibatch, observation=replay_buffer.expand(minibatch.observation))
 
 
 def compute_loss(

@@ -63,8 +63,8 @@ def train_iteration(ppo: PPO, train_state: TrainState, scenes: Scene) -> tuple[T
 
 def collect(ppo: PPO, train_state: TrainState, scenes: Scene, key: PRNGKeyArray) -> Collected:
     """Acts in all worlds."""
-    worlds, horizon = train_state.worlds, ppo.config.horizon
-    parts = rollout.collect_rollout(ppo.env, ppo.policy, train_state.parameters, scenes, worlds, key, horizon=horizon, axis=ppo.axis)
+    numbers = {"horizon": ppo.config.horizon, "storage": ppo.config.storage, "axis": ppo.axis}
+    parts = rollout.collect_rollout(ppo.env, ppo.policy, train_state.parameters, scenes, train_state.worlds, key, **numbers)
     return Collected(*parts)
 
 
@@ -167,7 +167,7 @@ def update_minibatch(
 ) -> tuple[tuple[Any, optax.OptState], dict[str, Array]]:
     """Makes one gradient step; nothing changes where it is not finite, or where no sample has weight."""
     parameters, optimizer = carry
-    minibatch = jax.tree.map(lambda x: x.at[index].get(mode="promise_in_bounds", unique_indices=True), batch)
+    minibatch = loss.take_minibatch(batch, index)
     objective = functools.partial(loss.compute_loss, policy=ppo.policy, config=ppo.config, axis=ppo.axis)
     result = jax.value_and_grad(objective, has_aux=True)(parameters, minibatch, log_std_old)
     (total, metrics), gradient = sharding.sum_over_devices(result, ppo.axis)
