@@ -434,7 +434,7 @@ def test_a_refusal_says_what_a_file_is_or_what_it_is_not(tmp_path, readers):
     cases = {
         f"{comment}<routes/>": "this is routes of SUMO: it is not read",
         f"{comment}<kml xmlns='x'>": "this is XML of the root element 'kml': it is not read",
-        "<?xml version='1.0' encoding='utf-16'?><net>".encode("utf-16"): "this is a network of SUMO",
+        "<?xml version='1.0' encoding='utf-16'?><OpenSCENARIO>".encode("utf-16"): "this is OpenSCENARIO",
         "<" + "?" * 9000: "unknown format: it begins with b'<???",
         b"SQLite format 3\0" + bytes(100): "this is an SQLite database",
         "": f"an empty file; formats: {', '.join(FORMATS)}",

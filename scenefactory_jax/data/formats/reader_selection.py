@@ -14,7 +14,6 @@ from scenefactory_jax.data.formats import file_content
 
 MAX_REASON = 80  # characters of a reader's refusal
 BANK_INDEX = "bank.json"  # the file that makes a folder a bank
-HEAD = 16_384  # bytes that identify formats without a reader: SUMO's networks begin with a comment of some thousand
 STARTS = {
     b"SQLite format 3\0": "an SQLite database, such as nuPlan's logs",
     b"\x89HDF": "HDF5",
@@ -116,8 +115,7 @@ def _find_reader(path: Path, formats: Mapping[str, Reader]) -> tuple[RawScene | 
 
 def _explain(path: Path, refusals: Sequence[str]) -> str:
     """Why no reader accepts a file: its format, or the refusals of readers of the same container, or its first bytes."""
-    with path.open("rb") as file:
-        head = file.read(HEAD)
+    head = file_content.read_head(path)
     if not head:
         return "an empty file"
     name = next((name for start, name in STARTS.items() if head.startswith(start)), None)
