@@ -83,7 +83,7 @@ def test_a_recording_is_cut_into_scenes(folder, readers):
         turn = 5 * time / 12 - half
         np.testing.assert_allclose(car.yaw, turn, atol=1e-4)
         centre = 12 * np.cos(half) * np.stack([np.sin(turn), -np.cos(turn)], axis=1)
-        np.testing.assert_allclose(car.xyz[:, :2], centre + [43, 12], atol=1e-3)
+        np.testing.assert_allclose(car.xyz[:, :2], centre + np.array([43, 12]), atol=1e-3)
         assert (raw.sdc, raw.current, raw.metadata["first_time_s"]) == (0, 3, 30.0 + 2 * number)
         assert raw.lights[0].valid.all() and np.array_equal(map_traffic.read_plan(raw.lights[0].plan, raw.times), raw.lights[0].state)
     ahead = np.concatenate([raw.lights[0].state for raw in scenes])  # lights of a step are those before the next one
