@@ -132,7 +132,7 @@ class CompareScenes:
 class ExportScenes:
     """`scenes op=export`."""
 
-    format: Literal["gpudrive", "scenarionet", "womd"]
+    format: Literal["gpudrive", "opendrive", "scenarionet", "womd"]
     womd: womd.Shapes
 
 
