@@ -432,7 +432,7 @@ def test_a_refusal_says_what_a_file_is_or_what_it_is_not(tmp_path, readers):
     long = json.dumps({f"key_{number}": 1 for number in range(500)})
     comment = f"<?xml version='1.0'?>\n<!-- <net> {'x' * 5000} -->\n"
     cases = {
-        f"{comment}<routes/>": "this is a route file of SUMO: give the network (.net.xml), or a recording (--fcd-output) beside it; formats: ",
+        f"{comment}<routes/>": "this is a route file of SUMO: give the network (.net.xml), or a recording (--fcd-output) beside it",
         "Vehicle_ID,Frame_ID,Total_Frames": "this is a recording of NGSIM (CSV): it is not read",
         '{"type": "FeatureCollection", "features": []}': "this is GeoJSON: it is not read",
         f"{comment}<kml xmlns='x'>": "this is XML of the root element 'kml': it is not read",
