@@ -54,7 +54,7 @@ def require_same_map(raw, again, ids):
     np.testing.assert_allclose(*walks, atol=0.02)
 
 
-@pytest.mark.parametrize("index", [1, 4, pytest.param(6, marks=pytest.mark.slow), pytest.param(7, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("index", [4, *(pytest.param(index, marks=pytest.mark.slow) for index in (1, 6, 7))])
 def test_a_town_comes_back_with_its_lanes_and_links(tmp_path, readers, index):
     entry = hydra_config.load_config("convert", "scenes=town")["scenes"]["generate"]
     raw = instantiate(entry, builtins="scenefactory_jax.data.generators.town.town_scene", where="generate")(0, index)
