@@ -158,7 +158,7 @@ def _make_states(raw: RawScene, count: int, shift: Float[np.ndarray, "3"]) -> di
     features = {}
     for name, table in columns.items():
         features |= _split(f"state/{name}", _pad(np.where(valid, table, PADDING), count), 1)
-    stamps = np.where(valid, np.round(1e6 * raw.times[steps]), PADDING)
+    stamps = np.where(inside, np.round(1e6 * raw.times[steps]), PADDING) * np.ones((len(tracks), 1))  # also where no object is valid
     features |= _split("state/timestamp_micros", _pad(stamps.astype(np.int64), count), 1)
     features |= _split("state/valid", _pad(valid.astype(np.int64), count, 0), 1)
     kinds = np.array([WOMD_TYPES.index(track.kind, 1) for track in tracks])
