@@ -1,5 +1,6 @@
 """The operations of `scenes` on banks: open them, call `data/curation/operations`, print the account, write the result."""
 
+import functools
 import json
 import sys
 from collections import Counter
@@ -20,7 +21,7 @@ from scenefactory_jax.data.bank.bank_reader import Bank
 from scenefactory_jax.data.curation import ego_choice, operations
 from scenefactory_jax.data.curation.features import COLUMNS
 from scenefactory_jax.data.curation.mirroring import mirror
-from scenefactory_jax.data.export import gpudrive, scenarionet
+from scenefactory_jax.data.export import gpudrive, opendrive, scenarionet, womd
 from scenefactory_jax.data.loading import scene_source
 
 SHOWN = 10  # groups of duplicates, values of a text, and refusals that are printed
@@ -112,7 +113,9 @@ def export(config: Mapping[str, Any]) -> int:
     A scene that cannot be written is listed, and the rest goes on.
     """
     name, out = config["export"]["format"], require_out(config, "the files")
-    write_all = {"gpudrive": gpudrive, "scenarionet": scenarionet}[name].write_all
+    write_womd = functools.partial(womd.write_all, shapes=womd.Shapes(**config["export"]["womd"]))
+    others = {module.__name__.rpartition(".")[2]: module.write_all for module in (gpudrive, opendrive, scenarionet)}
+    write_all = (others | {"womd": write_womd})[name]
     bank, check = _open(_get_path(config)), scene_source.make_packing(config["scenes"])["check"]
     refused: list[str] = []
     repairs: Counter[str] = Counter()

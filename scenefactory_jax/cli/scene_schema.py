@@ -5,6 +5,7 @@ from typing import Annotated, Literal
 
 from scenefactory_jax.cli.schema import Group, Task
 from scenefactory_jax.core.schema import Bounds, Count, Fraction, Seed
+from scenefactory_jax.data.export import womd
 from scenefactory_jax.data.loading.scenes_config import ScenesConfig
 
 
@@ -131,7 +132,8 @@ class CompareScenes:
 class ExportScenes:
     """`scenes op=export`."""
 
-    format: Literal["gpudrive", "scenarionet"]
+    format: Literal["gpudrive", "opendrive", "scenarionet", "womd"]
+    womd: womd.Shapes
 
 
 @dataclass(frozen=True)

@@ -187,6 +187,26 @@ def test_the_rim_of_a_metadrive_map_is_its_road_edge(tmp_path, readers):
     assert not any(line.kind in EDGES for line in one(written(tmp_path, dumped(whole)), plain).roads)
 
 
+def test_lanes_of_a_metadrive_map_lead_where_they_meet(tmp_path, readers):
+    """MetaDrive lists all lanes of the next road as exits, and all lanes to one side as neighbours."""
+    whole = metadrive_document()
+    features, ahead = whole["map_features"], [f"('>>', '>>>', {number})" for number in range(3)]
+    behind = [f"('>', '>>', {number})" for number in range(3)]
+    for key, name in zip(behind, ahead, strict=True):
+        place = features[key]["polyline"]
+        moved = {"polyline": place + (place[-1] - place[0]), "polygon": features[key]["polygon"] + (place[-1] - place[0])}
+        features[name] = features[key] | moved | {"entry_lanes": behind}
+        features[key] |= {"exit_lanes": ahead}
+    features[behind[0]]["right_neighbor"], features[behind[2]]["left_neighbor"] = behind[1:], behind[:2]
+    raw = one(written(tmp_path, dumped(whole)), readers)
+    names = {number: text for text, number in raw.metadata["tokens"]["features"].items()}
+    lanes = {names[line.id]: line for line in raw.roads}
+    assert [[names[i] for i in lanes[key].exit] for key in behind] == [[name] for name in ahead]
+    assert [[names[i] for i in lanes[name].entry] for name in ahead] == [[key] for key in behind]
+    assert [names[i] for i in (*lanes[behind[0]].right, *lanes[behind[2]].left)] == [behind[1]] * 2
+    assert raw.metadata["left_out"] == {"ROAD_EDGE_SIDEWALK": 1, "LINK_SIDEWAYS": 6}
+
+
 class Hostile:
     def __init__(self, call, *arguments):
         self.call, self.arguments = call, arguments
@@ -435,9 +455,11 @@ def test_a_refusal_says_what_a_file_is_or_what_it_is_not(tmp_path, readers):
     database.execute("CREATE TABLE other (x)")
     comment = f"<?xml version='1.0'?>\n<!-- <net> {'x' * 5000} -->\n"
     cases = {
-        f"{comment}<routes/>": "this is routes of SUMO: it is not read",
+        f"{comment}<routes/>": "this is a route file of SUMO: give the network (.net.xml), or a recording (--fcd-output) beside it",
+        "Vehicle_ID,Frame_ID,Total_Frames": "this is a recording of NGSIM (CSV): it is not read",
+        '{"type": "FeatureCollection", "features": []}': "this is GeoJSON: it is not read",
         f"{comment}<kml xmlns='x'>": "this is XML of the root element 'kml': it is not read",
-        "<?xml version='1.0' encoding='utf-16'?><net>".encode("utf-16"): "this is a network of SUMO",
+        "<?xml version='1.0' encoding='utf-16'?><OpenSCENARIO>".encode("utf-16"): "this is OpenSCENARIO",
         "<" + "?" * 9000: "unknown format: it begins with b'<???",
         database.serialize(): "unknown format: nuplan: an SQLite database, but no log of nuPlan: no table lidar_pc; formats: womd, ",
         "": f"an empty file; formats: {', '.join(FORMATS)}",

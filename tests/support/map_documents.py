@@ -171,3 +171,59 @@ def interaction_tables(steps=25):
     cars += [f"2,{n + 1},{100 * n + 100},car,20.0,5.25,0.0,0.0,0.1,5.0,2.0" for n in range(steps // 2)]
     people = [head, *(f"P1,{n + 1},{100 * n + 100},pedestrian/bicycle,45.0,{-3 - 0.1 * n:.3f},0.0,-1.0" for n in range(5, 9))]
     return "\n".join(cars) + "\n", "\n".join(people) + "\n"
+
+
+def sumo_net():
+    """A street of two lanes and a pavement climbs to a junction with a light; one lane goes ahead, and two in a row turn left."""
+    lane = '<lane id="{0}_{1}" index="{1}" speed="{2}" length="1" {3} shape="{4}"/>'.format
+    car, walk = 'disallow="pedestrian"', 'allow="pedestrian" width="2.0"'
+    edges = {
+        "in": [lane("in", 0, 13.89, walk, "0,-4.2,0 40,-4.2,2"), lane("in", 1, 13.89, car, "0,-1.6,0 40,-1.6,2"),
+               lane("in", 2, 10, car, "0,1.6,0 40,1.6,2")],
+        "ahead": [lane("ahead", 0, 13.89, car, "60,-1.6,2 100,-1.6,2")],
+        "aside": [lane("aside", 0, 8.33, f'{car} width="3.0"', "55,12,2 55,40,2")],
+        ":J_0": [lane(":J_0", 0, 9, car, "40,-1.6,2 60,-1.6,2")],
+        ":J_1": [lane(":J_1", 0, 5, car, "40,1.6,2 48,3,2")],
+        ":J_2": [lane(":J_2", 0, 5, car, "48,3,2 53,7,2 55,12,2")],
+        ":J_c0": [lane(":J_c0", 0, 1, 'allow="pedestrian" width="4.0"', "38,3 38,-3")],
+        ":J_w0": [lane(":J_w0", 0, 1, walk, "40,-5.2 44,-5.2 44,-3.2 40,-3.2")],
+    }  # fmt: skip
+    roles = {"in": 'from="A" to="J"', "ahead": 'from="J" to="B"', "aside": 'from="J" to="C"'}
+    roles |= {":J_c0": 'function="crossing"', ":J_w0": 'function="walkingarea"'}
+    inner = 'function="internal"'
+    edge = '<edge id="{}" {}>{}</edge>\n'.format
+    shown = "".join(edge(name, roles.get(name, inner), "".join(lanes)) for name, lanes in edges.items())
+    return f"""<?xml version="1.0"?>
+<net version="1.20"><location netOffset="-500.00,20.00" projParameter="+proj=utm"/>
+{shown}<tlLogic id="J" type="static" programID="0" offset="5"><phase duration="20" state="Gr"/><phase duration="4" state="yr"/>
+<phase duration="16" state="rG"/></tlLogic>
+<junction id="J" type="traffic_light" shape="40,3.2 40,-5.2 44,-5.2 60,-3.2 60,0 56.5,12 53.5,12"/>
+<connection from="in" to="ahead" fromLane="1" toLane="0" via=":J_0_0" tl="J" linkIndex="0" dir="s" state="O"/>
+<connection from="in" to="aside" fromLane="2" toLane="0" via=":J_1_0" tl="J" linkIndex="1" dir="l" state="o"/>
+<connection from=":J_0" to="ahead" fromLane="0" toLane="0" dir="s" state="M"/>
+<connection from=":J_1" to="aside" fromLane="0" toLane="0" via=":J_2_0" dir="l" state="m"/>
+<connection from=":J_2" to="aside" fromLane="0" toLane="0" dir="l" state="M"/>
+</net>"""
+
+
+def sumo_recording(steps, step_s=0.1, *, start_s=30.0, speed=5.0):
+    """A car on the right lane at constant speed, one of 5 m with both ends on a circle around (43, 12), and a person (XML, CSV)."""
+    xml, table = [], ["timestep_time;vehicle_id;vehicle_x;vehicle_y;vehicle_angle;vehicle_type;vehicle_speed;vehicle_lane;vehicle_edge"]
+    for time in start_s + step_s * np.arange(steps):
+        turn = speed * (time - start_s) / 12.0
+        angle = 90.0 - np.rad2deg(turn - np.arcsin(2.5 / 12.0))
+        users = [
+            ("vehicle", "a", 5 + speed * (time - start_s), -1.6, 90.0, "long", speed),
+            ("vehicle", "b", 43 + 12 * np.sin(turn), 12 - 12 * np.cos(turn), angle, "DEFAULT_VEHTYPE", speed),
+            ("person", "a", 10.0, -4.2, 180.0, "DEFAULT_PEDTYPE", 0.0),
+        ]
+        rows = "".join(
+            f'<{tag} id="{name}" x="{x:.4f}" y="{y:.4f}" angle="{angle:.4f}" type="{kind}" speed="{v}"/>'
+            for tag, name, x, y, angle, kind, v in users
+        )
+        xml.append(f'<timestep time="{time:.2f}">{rows}</timestep>\n')
+        for tag, name, x, y, angle, kind, v in users:
+            place = ";in" if tag == "person" else "in_1;"
+            table.append(f"{time:.2f};{name};{x:.4f};{y:.4f};{angle:.4f};{kind};{v};{place}")
+    head = f'<net-file value="some/where/town.net.xml"/><step-length value="{step_s}"/>'
+    return f"<?xml version='1.0'?>\n<!-- {head} -->\n<fcd-export>\n{''.join(xml)}</fcd-export>", "\n".join(table) + "\n"

@@ -35,7 +35,7 @@ QUANTITIES: dict[str, Quantity] = {
     "curvature_1_m": Quantity("curvature of lanes, 1/m", "3 m of lane"),
     "crosswalks": Quantity("crosswalks", "scene"),
     "stop_signs": Quantity("stop signs", "scene"),
-    "drivedistances": Quantity("drivedistances", "scene"),
+    "driveways": Quantity("driveways", "scene"),
     "lights": Quantity("lanes with a light", "scene"),
     "vehicles": Quantity("vehicles in the box", "scene"),
     "moving": Quantity("moving vehicles in the box", "scene"),
@@ -79,7 +79,7 @@ def measure(raw: RawScene, *, scene_size_m: float) -> Samples:
         "curvature_1_m": _joined([_curvature(points[near]) for points, near in lanes]),
         "crosswalks": count(CROSSWALK),
         "stop_signs": count(STOP_SIGN),
-        "drivedistances": count(DRIVEWAY),
+        "driveways": count(DRIVEWAY),
         "lights": np.array([len({light.lane for light in raw.lights})], float),
     }
     return samples | _measure_traffic(raw, centre, scene_size_m / 2)

@@ -1,7 +1,8 @@
 """Writes scenes as GPUDrive's JSON, for GPUDrive, PufferDrive's converter and all other readers of it.
 
-The format has no lane links, speed limits, lanes of stop signs, cycles of lights beyond the log, dataset name, origin, current step and
-times: its readers expect WOMD's 10 Hz and step 10, and GPUDrive itself 91 steps.
+Links and limits of lanes and the lanes of stop signs are further keys, under WOMD's names, which other readers pass over. The format has no
+cycles of lights beyond the log, dataset name, origin, current step and times: its readers expect WOMD's 10 Hz and step 10, and GPUDrive
+itself 91 steps.
 """
 
 import json
@@ -14,6 +15,7 @@ import numpy as np
 from scenefactory_jax.core.raw_scene import LIGHT_STATES, Light, Polyline, RawScene, SceneError, Track
 from scenefactory_jax.core.safe_names import to_file_name
 from scenefactory_jax.data.export import files
+from scenefactory_jax.data.formats.gpudrive import LINKS, MPH, SIGN_LANES, SPEED_LIMIT
 
 NOWHERE = -10000.0  # every value at an invalid step
 TYPES = (  # map elements -> the type's name
@@ -87,7 +89,11 @@ def _road(line: Polyline, source: str) -> dict[str, Any]:
     name = next((name for kinds, name in TYPES if line.kind in kinds), None)
     if name is None:
         raise SceneError(f"{source}: road {line.id}: GPUDrive has no type for the map element {line.kind}; expected 0 to 20")
-    return {"geometry": _rows(line.xyz, "xyz"), "type": name, "map_element_id": line.kind, "id": line.id}
+    road = {"geometry": _rows(line.xyz, "xyz"), "type": name, "map_element_id": line.kind, "id": line.id}
+    if name == "lane":
+        road |= {key: list(getattr(line, field)) for field, key in LINKS.items()}
+        road |= {} if line.speed_limit is None else {SPEED_LIMIT: line.speed_limit / MPH}
+    return road | ({SIGN_LANES: list(line.lanes)} if line.lanes else {})
 
 
 def _light(light: Light) -> dict[str, list[Any]]:

@@ -16,7 +16,7 @@ from scenefactory_jax.core.raw_scene import FormatMismatch, SceneError
 MAGIC = {b"\x1f\x8b": ("gzip", gzip.open), b"\xfd7zXZ\x00": ("xz", lzma.open)}
 DAMAGE = (OSError, EOFError, lzma.LZMAError, zlib.error)  # errors of unpacking a damaged file
 CHUNK = 2**20  # bytes read at a time: memory follows the content of a file, not the size that it declares
-HEAD = 4096  # bytes that identify a format
+HEAD = 16_384  # bytes that identify a format: files of SUMO begin with a comment of some thousand
 
 _cache: ContextVar[dict[Path, bytes] | None] = ContextVar("cache", default=None)
 

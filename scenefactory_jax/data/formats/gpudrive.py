@@ -2,7 +2,8 @@
 
 `{name, scenario_id, objects[], roads[], tl_states{}, metadata{}}`. A light lists, for a lane, the steps at which it was observed, and
 columns over these: `{state[], x[], y[], z[], time_index[]}` (GPUDrive's `process_waymo_files.py`). The old layout of Nocturne has neither
-ids nor map elements nor metadata nor heights, and its headings are in degrees.
+ids nor map elements nor metadata nor heights, and its headings are in degrees. Links and limits of lanes and the lanes of stop signs are
+read where `export.gpudrive` wrote them: under the names of WOMD's `map.proto`, which other readers pass over.
 """
 
 from collections.abc import Iterator
@@ -19,6 +20,9 @@ from scenefactory_jax.data.formats.values import AXES, Node
 
 # map element of a type where `map_element_id` is missing
 ELEMENTS = {"lane": 2, "road_line": 6, "road_edge": 15, "stop_sign": 17, "crosswalk": 18, "speed_bump": 19, "driveway": 20}
+
+LINKS = {"entry": "entry_lanes", "exit": "exit_lanes", "left": "left_neighbors", "right": "right_neighbors"}
+SIGN_LANES, SPEED_LIMIT, MPH = "lane", "speed_limit_mph", 1609.344 / 3600  # m/s
 
 
 def read(
@@ -97,7 +101,12 @@ def _polyline(record: Node, index: int) -> Polyline:
         kind = ELEMENTS[name]
     else:
         raise SceneError(f"{record.where}.type: expected {', '.join(ELEMENTS)} where there is no map_element_id, got {name!r}")
-    return Polyline(kind=kind, xyz=xyz, id=record.get("id", index).expect(int))
+    links: dict[str, Any] = {name: tuple(record[key].integers()) for name, key in LINKS.items() if key in record}
+    if SIGN_LANES in record:
+        links["lanes"] = tuple(record[SIGN_LANES].integers())
+    if SPEED_LIMIT in record:
+        links["speed_limit"] = record[SPEED_LIMIT].expect(float) * MPH
+    return Polyline(kind=kind, xyz=xyz, id=record.get("id", index).expect(int), **links)
 
 
 def _lights(states: Node, steps: int) -> tuple[Light, ...]:

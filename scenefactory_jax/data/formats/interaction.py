@@ -62,7 +62,7 @@ def read(
     tracks = _make_tracks(rows, ids, roads.roads, (*person_size_m, height_m), str(path))
     length = len(tracks[0].valid)
     for number, first in enumerate(range(0, length - steps + 1, steps)):
-        part = [_cut(track, first, first + steps) for track in tracks if track.valid[first : first + steps].any()]
+        part = scene_parts.cut_tracks(tracks, slice(first, first + steps))
         if not part:
             continue
         yield RawScene(
@@ -72,7 +72,7 @@ def read(
             tracks=tuple(part),
             times=STEP_MS / 1000 * np.arange(steps),
             current=current,
-            sdc=_choose(part),
+            sdc=scene_parts.choose_recording_car(part),
             metadata={
                 "dataset": "interaction",
                 "format": "interaction",
@@ -154,15 +154,3 @@ def _make_tracks(
             scene_parts.make_track(f"{where}: track {name[:20]}", id=ids[name], kind=kind, size=(*map(float, size), person[2]), **entries)
         )
     return tracks
-
-
-def _cut(track: Track, first: int, stop: int) -> Track:
-    """The steps of a scene."""
-    part = slice(first, stop)
-    return Track(track.id, track.kind, track.size, track.xyz[part], track.yaw[part], track.velocity[part], track.valid[part])
-
-
-def _choose(tracks: Sequence[Track]) -> int | None:
-    """The vehicle that drives farthest, of those present at all steps; None if there is none."""
-    travel = [np.linalg.norm(t.velocity, axis=1).sum() if t.kind == "vehicle" and t.valid.all() else -1.0 for t in tracks]
-    return int(np.argmax(travel)) if max(travel) >= 0 else None

@@ -14,13 +14,18 @@ from scenefactory_jax.data.formats import file_content
 
 MAX_REASON = 72  # characters of a reader's refusal
 BANK_INDEX = "bank.json"  # the file that makes a folder a bank
-HEAD = 16_384  # bytes that identify formats without a reader: SUMO's networks begin with a comment of some thousand
 STARTS = {
     b"\x89HDF": "HDF5",
     b"PK\x03\x04": "a ZIP archive",
     b"BZh": "a file compressed by bzip2",
     b"\x28\xb5\x2f\xfd": "a file compressed by Zstandard",
+    b"\x93NUMPY": "an array of NumPy",
+    b"#ROSBAG": "a bag of ROS",
+    b"\x89MCAP": "MCAP, a bag of ROS 2",
     b"track_id,frame_id,timestamp_ms,": "a recording of INTERACTION (CSV)",
+    b"frame,id,x,y,width,height,": "a recording of highD (CSV)",
+    b"recordingId,trackId,frame,": "a recording of inD, rounD, uniD or exiD (CSV)",
+    b"Vehicle_ID,Frame_ID,": "a recording of NGSIM (CSV)",
 }
 ROOTS = {
     "OpenDRIVE": "OpenDRIVE",
@@ -28,10 +33,13 @@ ROOTS = {
     "commonRoad": "CommonRoad",
     "osm": "OpenStreetMap XML, such as the Lanelet2 maps of INTERACTION",
     "net": "a network of SUMO",
-    "routes": "routes of SUMO",
-    "additional": "additional elements of SUMO",
+    "fcd-export": "a recording of SUMO",
+    "routes": "a route file of SUMO",
+    "additional": "a file of additional elements of SUMO",
+    "configuration": "a configuration, such as SUMO's",
     "sumoConfiguration": "a configuration of SUMO",
 }
+GIVE = {root: "give the network (.net.xml), or a recording (--fcd-output) beside it" for root in list(ROOTS)[-4:]}
 BEFORE_ROOT = re.compile(r"<\?.*?\?>|<!--.*?-->|<!DOCTYPE[^>]*>", re.DOTALL)  # declaration, comments and document type
 Reader = Callable[[Path], Iterator[RawScene | Reject]]
 
@@ -115,8 +123,7 @@ def _find_reader(path: Path, formats: Mapping[str, Reader]) -> tuple[RawScene | 
 
 def _explain(path: Path, refusals: Sequence[str]) -> str:
     """Why no reader accepts a file: its format, or the refusals of readers of the same container, or its first bytes."""
-    with path.open("rb") as file:
-        head = file.read(HEAD)
+    head = file_content.read_head(path)
     if not head:
         return "an empty file"
     name = next((name for start, name in STARTS.items() if head.startswith(start)), None)
@@ -124,6 +131,8 @@ def _explain(path: Path, refusals: Sequence[str]) -> str:
     root = re.match(r"<(?:\w+:)?([\w.-]+)", BEFORE_ROOT.sub("", text).lstrip()) if text.startswith("<") else None
     if name is None and root is not None:
         name = ROOTS.get(root[1], f"XML of the root element {root[1][:40]!r}")
+    if name is None and re.search(r'"type"\s*:\s*"FeatureCollection"', text):
+        name = "GeoJSON"
     if name is not None:
-        return f"this is {name}: it is not read"
+        return f"this is {name}: {GIVE.get(root[1], 'it is not read') if root is not None else 'it is not read'}"
     return f"unknown format: {'; '.join(refusals) or f'it begins with {head[:16]!r}'}"

@@ -6,7 +6,7 @@ layouts are read, too (`scenarionet_legacy`).
 
 This reader undoes four things of the converters: nuScenes' lanes are poses, whose third column is a heading instead of a height; length
 and width of nuScenes' recording car are exchanged; the outline of the drivable area is stored as white lines (`boundary_7`); and
-MetaDrive's own maps have solid lines in place of road edges (`metadrive_map`).
+MetaDrive's own maps have solid lines in place of road edges, and links to all lanes of the next road (`metadrive_map`).
 """
 
 from collections import Counter
@@ -88,6 +88,9 @@ def read(
     roads, left_out = _roads(document["map_features"], feature_ids, outlines_are_edges, dataset)
     rims = _find_rims(roads, document["map_features"]) if outlines_are_edges and dataset == METADRIVE else []
     roads = [replace(line, kind=EDGE_BOUNDARY) if place in rims else line for place, line in enumerate(roads)]
+    if dataset == METADRIVE:
+        roads, sideways = metadrive_map.keep_meeting_links(roads)
+        left_out.update(["LINK_SIDEWAYS"] * sideways)
     if dataset != "waymo":
         sparse = lambda line: line.kind not in POLYGONS and len(line.xyz) > 0  # noqa: E731
         roads = [replace(line, xyz=polylines.densify(line.xyz, point_spacing_m)) if sparse(line) else line for line in roads]

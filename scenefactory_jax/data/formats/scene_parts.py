@@ -2,6 +2,7 @@
 
 import re
 from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -50,6 +51,18 @@ def make_track(
     xyz, velocity = (np.where(valid[:, None], table, 0.0) for table in (position, velocity))
     yaw = np.where(valid, wrap_angles(heading), 0.0)
     return Track(id=id, kind=kind, size=(length, width, height), xyz=xyz, yaw=yaw, velocity=velocity, valid=valid)
+
+
+def cut_tracks(tracks: Iterable[Track], part: slice) -> list[Track]:
+    """The tracks that are present at some of the steps, at these steps."""
+    at = lambda track: {name: getattr(track, name)[part] for name in ("xyz", "yaw", "velocity", "valid")}  # noqa: E731
+    return [replace(track, **at(track)) for track in tracks if track.valid[part].any()]
+
+
+def choose_recording_car(tracks: Sequence[Track]) -> int | None:
+    """The vehicle that drives farthest, of those present at all steps, for logs that have no recording car; None if there is none."""
+    travel = [np.linalg.norm(t.velocity, axis=1).sum() if t.kind == "vehicle" and t.valid.all() else -1.0 for t in tracks]
+    return int(np.argmax(travel)) if max(travel, default=-1.0) >= 0 else None
 
 
 def check_times(times: Float[np.ndarray, " L"], where: str) -> None:

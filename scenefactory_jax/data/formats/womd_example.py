@@ -147,9 +147,10 @@ def _states(
             continue
         table = features.columns(prefix, STATE, flags).reshape(objects, -1, len(STATE))
         valid, stamps = (column.reshape(objects, -1) for column in (flags, features.integers(f"{prefix}timestamp_micros", count)))
-        if not (known := valid.any(axis=0)).all():
+        clock = np.where(valid.any(axis=0), np.where(valid, stamps, np.iinfo(np.int64).min).max(axis=0), stamps.max(axis=0))
+        if not (known := valid.any(axis=0) | (clock >= 0)).all():
             raise SceneError(f"{where}{prefix}valid: no object is valid at step {int(np.argmin(known))}, so its time is not known")
-        periods.append((table, valid, np.where(valid, stamps, np.iinfo(np.int64).min).max(axis=0)))
+        periods.append((table, valid, clock))
         current += valid.shape[1] if period == "past" else 0
     numbers, valid = (np.concatenate([entry[column] for entry in periods], axis=1) for column in (0, 1))
     times = np.concatenate([stamps for *_, stamps in periods]) / MICROSECONDS

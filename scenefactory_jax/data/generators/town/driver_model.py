@@ -15,7 +15,7 @@ from scenefactory_jax.core.schema import Positive
 from scenefactory_jax.core.types import RoadUser
 from scenefactory_jax.data.generators.town.lane_paths import STEP_M, Path
 from scenefactory_jax.data.generators.town.path_conflicts import ROW_M, find_zones, project_paths, stack_columns
-from scenefactory_jax.data.generators.town.traffic_lights import CLOSED, CLOSING, SIGN
+from scenefactory_jax.data.generators.town.traffic_lights import CLOSED, CLOSING, OPEN, SIGN
 
 FREE_EXPONENT = 4.0  # of the IDM
 MIN_GAP_M = 0.3  # lower bound of gaps
@@ -75,10 +75,22 @@ class Motion(NamedTuple):
 
 
 def simulate(
-    users: list[SimulatedUser], gates: Int[np.ndarray, "G L"], times: Float[np.ndarray, " L"], driver: DriverParameters
+    users: list[SimulatedUser],
+    gates: Int[np.ndarray, "G L"],
+    times: Float[np.ndarray, " L"],
+    driver: DriverParameters,
+    *,
+    runs: Bool[np.ndarray, " N"] | None = None,
+    turns: Bool[np.ndarray, "N S"] | None = None,
 ) -> Motion:
-    """Simulates all steps with constant accelerations within each step; `gates` are the states of stops and crosswalks."""
+    """Simulates all steps with constant accelerations within each step; `gates` are the states of stops and crosswalks.
+
+    Args:
+        runs, turns: who does not stop at closed gates, and for whom they are as stop signs; None: nobody.
+    """
     simulation = Simulation(users, driver)
+    simulation.runs = simulation.runs if runs is None else runs[:, None] | simulation.runs
+    simulation.turns = simulation.turns if turns is None else turns
     log = []
     for step, now in enumerate(times):
         log.append((simulation.place, np.where(simulation.present, simulation.speed, 0.0), simulation.present))
@@ -107,6 +119,7 @@ class Simulation:
             for slot, (place, gate) in enumerate(path.gates):
                 self.gate_place[row, slot], self.gate[row, slot] = place, gate
         self.waited = np.zeros(self.gate.shape)  # standing times at signs, s
+        self.runs, self.turns = (np.zeros(self.gate.shape, bool) for _ in range(2))  # see `simulate`
 
     @property
     def present(self) -> Bool[np.ndarray, " N"]:
@@ -136,6 +149,7 @@ class Simulation:
         """Computes the distance to the nearest closed stop line, inf: none; counts the standing time at signs."""
         driver = self.driver
         state = gates[self.gate] if gates.size else np.zeros(self.gate.shape, int)
+        state = np.where((state == CLOSED) & self.turns, SIGN, np.where(np.isin(state, (CLOSED, CLOSING)) & self.runs, OPEN, state))
         line = self.gate_place - (self.place + self.length / 2)[:, None] - driver.line_gap_m
         standing = (self.speed < STANDING_MPS)[:, None] & (line < 2.0) & (line > -driver.line_gap_m)
         self.waited = self.waited + dt * (standing & (state == SIGN))

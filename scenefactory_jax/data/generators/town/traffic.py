@@ -8,6 +8,7 @@ from scenefactory_jax.core.schema import CountRange, Range
 from scenefactory_jax.data.generators.curves import Points, interpolate
 from scenefactory_jax.data.generators.town import road_users
 from scenefactory_jax.data.generators.town.driver_model import DriverParameters, SimulatedUser, simulate
+from scenefactory_jax.data.generators.town.imperfect_drivers import Faults, ImperfectDrivers, draw_faults, drift
 from scenefactory_jax.data.generators.town.lane_paths import STEP_M
 from scenefactory_jax.data.generators.town.road_network import Network
 from scenefactory_jax.data.generators.town.road_users import CyclistNumbers, DrivingNumbers, PedestrianNumbers, TownUser
@@ -39,6 +40,7 @@ def populate(
     driver: DriverParameters,
     cyclists: CyclistNumbers,
     pedestrians: PedestrianNumbers,
+    imperfect: ImperfectDrivers | None = None,
 ) -> list[TownUser]:
     """Draws and simulates all road users over `times`, which include the warm-up, as `gates` do."""
     simulated = [
@@ -48,17 +50,26 @@ def populate(
     ]
     strollers = road_users.draw_strollers(rng, kerbs, surface, times, pedestrians)
     parked = road_users.draw_parked_cars(rng, network, rng.uniform(*parked_fraction), times, driving)
-    users = [*(_simulate(simulated, gates, times, driver) if simulated else []), *strollers, *parked]
+    faults = None if imperfect is None or not simulated else draw_faults(rng, simulated, imperfect)
+    users = [*(_simulate(simulated, gates, times, driver, faults) if simulated else []), *strollers, *parked]
     users = [_limit_travel(user, times, travel_m[1]) for user in users]
     return separate_users([user for user in users if user.kind != "vehicle" or _is_on_road(user, surface, reach)])
 
 
-def _simulate(users: list[SimulatedUser], gates: Gates, times: Float[np.ndarray, " L"], driver: DriverParameters) -> list[TownUser]:
+def _simulate(
+    users: list[SimulatedUser], gates: Gates, times: Float[np.ndarray, " L"], driver: DriverParameters, faults: Faults | None
+) -> list[TownUser]:
     """Simulates the road users along their paths."""
-    logs, motion = [], simulate(users, gates.state, times, driver)
-    for user, place, speed, present in zip(users, motion.place.T, motion.speed.T, motion.present.T, strict=True):
+    wrong = {} if faults is None else {"runs": faults.runs, "turns": faults.turns}
+    users = users if faults is None else faults.users
+    logs, motion = [], simulate(users, gates.state, times, driver, **wrong)
+    for number, (user, place, speed, present) in enumerate(
+        zip(users, motion.place.T, motion.speed.T, motion.present.T, strict=True)
+    ):
         row, rows = place / STEP_M, np.arange(len(user.path.points), dtype=float)
         position, yaw = interpolate(row, rows, user.path.points), np.interp(row, rows, user.path.yaw)
+        if faults is not None and faults.drift_m[number] > 0:
+            position, yaw = drift(position, yaw, place, float(faults.drift_m[number]), float(faults.drift_length_m[number]))
         logs.append(TownUser(user.kind, user.size, position, yaw, speed, present))
     return logs
 
