@@ -107,8 +107,13 @@ def evaluations_while_training(plan: Plan, training: Training) -> list[Evaluatio
 
 def digest_scenes(config: Mapping[str, Any], path: str | None) -> str:
     """Computes a digest of the settings of a `scenes` entry that decide its scenes, before `take`."""
-    entry = {name: value for name, value in config.items() if name not in ("take", "heldout", "workers", "path")}
+    entry = {name: value for name, value in config.items() if name not in ("take", "heldout", "workers", "path", *_unread(path))}
     return result_file.digest({**entry, "path": None if path is None else str(path)})
+
+
+def _unread(path: str | None) -> tuple[str, ...]:
+    """Keys of a `scenes` entry that decide nothing: the readers of formats read neither banks nor what a generator makes."""
+    return () if path is not None and not bank_index.is_bank(path) else ("formats",)
 
 
 @functools.lru_cache
@@ -231,7 +236,8 @@ def _plan_trainings(config: Mapping[str, Any], variant: str, seeds: list[int]) -
 
 def _plan_training(settings: dict[str, Any], variant: str, overrides: list[str], runs: Path) -> Training:
     entry = {name: value for name, value in settings.items() if name not in IGNORED}
-    entry["scenes"] = {name: value for name, value in settings["scenes"].items() if name not in ("heldout", "workers")}
+    unread = ("heldout", "workers", *_unread(settings["scenes"]["path"]))
+    entry["scenes"] = {name: value for name, value in settings["scenes"].items() if name not in unread}
     entry |= _digest_entry(settings["scenes"]["path"])
     if settings["scenes"]["take"]["count"] is None:
         entry["scenes"].pop("take")  # its seed follows that of the run

@@ -545,6 +545,17 @@ def test_other_scenes_of_the_same_path_are_another_study(tmp_path):
     assert found[0][0] != found[1][0] and found[0][1] != found[1][1] and found[1] == found[2]
 
 
+@pytest.mark.parametrize("is_bank", [True, False])
+def test_readers_of_formats_change_no_study_of_banks(tmp_path, is_bank):
+    """A version that reads one format more finds what was trained before."""
+    (tmp_path / "scenes").mkdir()
+    (tmp_path / "scenes" / (bank_index.INDEX if is_bank else "a.json")).write_text(json.dumps({"format": bank_index.FORMAT, "shards": []}))
+    entry = toy(tmp_path, f"train_scenes={tmp_path / 'scenes'}", f"test_scenes={tmp_path / 'scenes'}", **ALONE)
+    before, after = (study_plan.make({**entry, "common": [f"scenes.formats.nuplan.current={step}"]}) for step in (10, 11))
+    assert (before.trainings[0].digest == after.trainings[0].digest) == is_bank
+    assert (before.evaluations[0].program == after.evaluations[0].program) == is_bank
+
+
 @pytest.mark.parametrize(
     ("name", "base"),
     [
