@@ -12,12 +12,12 @@ import types
 import typing
 
 import jaxtyping
-from beartype import BeartypeConf
+from beartype import BeartypeConf, beartype
 from jaxtyping import _storage
 from jaxtyping._array_types import AbstractArray
 
 jaxtyped = jaxtyping.jaxtyped
-CONF = BeartypeConf(violation_type=jaxtyping.TypeCheckError)
+beartyped = beartype(conf=BeartypeConf(violation_type=jaxtyping.TypeCheckError))
 NEEDS = {}  # code of a function -> its check; functions within others are decorated at each call of the outer one
 
 
@@ -51,9 +51,9 @@ def choose_check(function):
     return "types"
 
 
-def check_shapes(function, typechecker):
+def check_shapes(function):
     """In place of jaxtyping's check, which binds the arguments by their signature and checks them again beside the result."""
-    checked = typechecker(conf=CONF)(function)
+    checked = beartyped(function)
 
     @functools.wraps(function)
     def call(*arguments, **named):
@@ -93,7 +93,7 @@ def check_from_first_call(function, check):
 def check_as_needed(function, need, typechecker):
     simple = need == "shapes" and not inspect.isgeneratorfunction(function) and not inspect.isasyncgenfunction(function)
     if simple and all(map(is_simple, function.__annotations__.values())):
-        check = functools.partial(check_shapes, typechecker=typechecker)
+        check = check_shapes
     else:
         check = typechecker if need == "types" else functools.partial(jaxtyped, typechecker=typechecker)
     return check_from_first_call(function, check)
