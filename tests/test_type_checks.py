@@ -1,5 +1,6 @@
 """The cheap checks of annotations refuse what jaxtyping's refuse."""
 
+import dataclasses
 from collections.abc import Callable
 
 import jax.numpy as jnp
@@ -11,7 +12,7 @@ from support import type_checks
 
 from scenefactory_jax.core import geometry, safe_names
 
-Road = Float[Array, "points 2"]
+Road, Counted = Float[Array, "points 2"], Float[Array, "{count} 2"]
 
 
 def decorated(function):
@@ -31,8 +32,41 @@ def test_shapes_are_checked_wherever_an_annotation_names_them():
         return one + other
 
     both(jnp.ones((3, 2)), jnp.ones((3, 2)))
-    with pytest.raises(TypeCheckError):
+    with pytest.raises(TypeCheckError) as caught:
         both(jnp.ones((3, 2)), jnp.ones((1, 2)))
+    assert "points=3" in caught.value.__notes__[0]
+
+    @decorated
+    def shorten(value: Road) -> Road:
+        return both(value, value)[1:]
+
+    with pytest.raises(TypeCheckError):
+        shorten(jnp.ones((3, 2)))
+
+
+def test_sizes_that_arguments_decide_are_checked():
+    @decorated
+    def fill(count: int, size: int) -> Counted:
+        return jnp.ones((size, 2))
+
+    assert fill(3, 3).shape == (3, 2)
+    with pytest.raises(TypeCheckError):
+        fill(3, 4)
+
+
+def test_fields_of_a_dataclass_are_checked():
+    @dataclasses.dataclass(frozen=True)
+    class Pair:
+        one: Road
+        other: Road | None = None
+
+    checked = decorated(Pair)
+    assert checked is Pair and checked(jnp.ones((3, 2))).other is None
+    for other in (jnp.ones((1, 2)), 2.0):
+        with pytest.raises(TypeCheckError):
+            checked(jnp.ones((3, 2)), other)
+    with pytest.raises(TypeCheckError):
+        dataclasses.replace(checked(jnp.ones((3, 2))), other=jnp.ones((1, 2)))
 
 
 def test_plain_types_are_checked_without_shapes():

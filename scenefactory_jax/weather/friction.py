@@ -50,14 +50,19 @@ class Surface:
     mu: Positive | None = None  # friction coefficient at any speed and film, in place of what the model computes
 
 
+CHECKED: set[str] = set()  # values that `make` has traced
+
+
 def make(entry: Mapping[str, Any]) -> Callable[[Weather, Float[Array, "*shape 2"], Float[Array, "*shape"]], Float[Array, "*shape"]]:
-    """Binds `weather.friction` of a config to its values, and traces it once to check them.
+    """Binds `weather.friction` of a config to its values, and traces it to check them, once in a process for the same values.
 
     Raises:
         ConfigError: naming the key that does not fit.
     """
     bound = instantiate(entry, builtins=__name__, where="weather.friction")
-    jax.eval_shape(bound, make_uniform(jnp.float32(0.0), jnp.int32(0)), jnp.zeros((1, 4, 2)), jnp.zeros((1, 4)))
+    if repr(entry) not in CHECKED:
+        jax.eval_shape(bound, make_uniform(jnp.float32(0.0), jnp.int32(0)), jnp.zeros((1, 4, 2)), jnp.zeros((1, 4)))
+        CHECKED.add(repr(entry))
     return bound
 
 

@@ -29,7 +29,7 @@ def worlds():
     starts = np.array([[0.0, 0.0], [6.0, 0.3], [1.0, 3.5], [-30.0, 0.0]])
     goals, speeds = starts + np.array([40.0, 0.0]), [9.0, 4.0, 5.0, 6.0]
     scenes = [scene_of(starts, goals, speeds=speeds, present=[True, True, True, last]) for last in (False, True)]
-    return jax.tree.map(lambda *leaves: jnp.stack(leaves), *scenes)
+    return jax.device_put(jax.tree.map(lambda *leaves: np.stack(leaves), *scenes))
 
 
 @pytest.fixture(scope="module")

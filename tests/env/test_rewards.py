@@ -20,6 +20,8 @@ from scenefactory_jax.core.pytree import replace
 from scenefactory_jax.core.types import Events, Motion, RewardInput, State
 from scenefactory_jax.env import environment, rewards, route_following, termination
 
+pytestmark = pytest.mark.usefixtures("quickly")
+
 FAR = [[50.0, 0.0]]  # a goal that is ahead and not reached
 EVENTS = (  # in the order of precedence
     "numerical_error", "goal_reached", "collision", "out_of_bounds", "road_edge_contact", "red_light", "stop_sign", "off_route",

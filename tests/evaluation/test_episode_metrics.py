@@ -32,6 +32,8 @@ from scenefactory_jax.evaluation.metrics.episode_steps import measure_steps
 from scenefactory_jax.evaluation.metrics.waymax_steps import Paths
 from scenefactory_jax.roadgraph.signed_edge_distance import EdgePoints
 
+pytestmark = pytest.mark.usefixtures("quickly")
+
 STEPS, DT, POINTS = 41, 0.1, 141
 TIME = DT * (np.arange(STEPS) - 10)  # the first 10 states are the past
 LANE = 7

@@ -68,7 +68,7 @@ def braked():
     dynamics = {"_target_": f"{__name__}.make_sliding", "car": car, "contact": task["dynamics"]["contact"]}
     task |= {"policy": {"_target_": f"{__name__}.brake"}, "dynamics": dynamics}
     worlds = [scene_of([[0, 0], [x, 0]], [[50, 0], [58, 0]], speeds=[SPEED, 0.0]) for x in AHEAD]
-    scene = jax.tree.map(lambda *leaves: jnp.stack(leaves), *worlds)
+    scene = jax.device_put(jax.tree.map(lambda *leaves: np.stack(leaves), *worlds))
     failures = load_config("evaluate", "run=null")["failures"]
     drive = friction_search.make_driver(task, SETTINGS, failures=failures, ttc_limit_s=10.0)
     mu_of = friction_search.make_mu(task)

@@ -23,6 +23,8 @@ from scenefactory_jax.evaluation import scoring
 from scenefactory_jax.evaluation.episodes import EpisodeFrame, TrafficFrame
 from scenefactory_jax.evaluation.settings import ScoreSettings
 
+pytestmark = pytest.mark.usefixtures("quickly")
+
 HZ, SECONDS, SPEED, PAST = 30, 4, 8.0, 2
 WALL_M, LENGTH_M = 20.0, 4.0  # to the standing car; of both cars
 
@@ -67,7 +69,12 @@ def episode():
 def test_states_are_past_start_and_every_tenth_of_a_second():
     scene, start, frames = episode()
     thinned = jax.tree.map(lambda leaf: jnp.asarray(leaf[HZ // 10 - 1 :: HZ // 10]), frames)
-    users, log = scoring.collect_users(scene, start, thinned, past_rows=PAST), scoring.read_log(scene, PAST, 10 * SECONDS)
+
+    @jax.jit
+    def read(scene, start, thinned):
+        return scoring.collect_users(scene, start, thinned, past_rows=PAST), scoring.read_log(scene, PAST, 10 * SECONDS)
+
+    users, log = read(scene, start, thinned)
     expected = SPEED * 0.1 * np.arange(-PAST, 10 * SECONDS + 1)
     np.testing.assert_allclose(users.position[0, :, 0], expected, atol=1e-5)
     np.testing.assert_array_equal(users.valid[0], np.arange(len(expected)) > 0)  # the first row of the log is not valid

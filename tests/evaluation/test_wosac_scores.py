@@ -47,7 +47,7 @@ def make_scene(variant):
 def scores():
     """Scores of all variants, by name, and their means."""
     score = jax.vmap(functools.partial(wosac_scores.score_rollouts, challenge=wosac_scores.CHALLENGES[2025]))
-    scenes = jax.tree.map(lambda *rows: jnp.stack(rows), *map(make_scene, VARIANTS))
+    scenes = jax.device_put(jax.tree.map(lambda *rows: np.stack(rows), *map(make_scene, VARIANTS)))
     found, means = jax.jit(lambda scenes: (each := score(*scenes), wosac_scores.average_scenes(each)))(scenes)
     found = jax.tree.map(np.asarray, found)
     return {name: jax.tree.map(lambda values, row=row: values[row], found) for row, name in enumerate(VARIANTS)}, means

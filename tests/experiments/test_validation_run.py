@@ -44,22 +44,32 @@ def drive(entry):
     return motion_laws.driver(entry, slippery=0.125, width=4, **RATES)
 
 
-@pytest.fixture(scope="module")
-def without_abs(entry):
-    return motion_laws.driver({**entry, "abs": False}, slippery=0.125, width=4, **RATES)
-
-
 STOP = dict(frictions=[0.2, 0.5, 1.1], wheel_radius=0.35, **CLOCK)
 
 
-def test_stops_use_the_friction_and_the_front_axle_locks_first(drive, without_abs):
-    for run, locks in ((drive, False), (without_abs, True)):
-        found = motion_laws.stopping(run, speed=10.0, seconds=6.0, **STOP)
-        ratio = found["distance_m"] / (10.0**2 / (2 * found["friction"] * G))
-        assert found["stopped"].all() and found["aside_m"].max() < 0.05 and (ratio > 0.9).all() and (ratio < 1.1).all(), ratio
-        assert ((found["front_locks_s"] >= 0.0) == locks).all()
-        assert ((found["rear_locks_s"] < 0.0) | (found["rear_locks_s"] > found["front_locks_s"])).all()
+def stop(run):
+    found = motion_laws.stopping(run, speed=10.0, seconds=6.0, **STOP)
+    ratio = found["distance_m"] / (10.0**2 / (2 * found["friction"] * G))
+    assert found["stopped"].all() and found["aside_m"].max() < 0.05 and (ratio > 0.9).all() and (ratio < 1.1).all(), ratio
+    return found["front_locks_s"], found["rear_locks_s"]
+
+
+def test_stops_use_the_friction_and_locked_wheels_are_found(drive):
+    def locking(cases):
+        trace = drive(cases)
+        for wheels, steps in ((motion_laws.SPIN[:2], 4), (motion_laws.SPIN[2:], 8)):
+            trace.qvel[:, steps:, wheels] = 0.0
+        return trace
+
+    for run, front, rear in ((drive, -1.0, -1.0), (locking, 5 / 30, 9 / 30)):
+        np.testing.assert_allclose(stop(run), [[front] * 3, [rear] * 3])
     assert not motion_laws.stopping(drive, speed=10.0, seconds=1.0, **{**STOP, "frictions": [0.1]})["stopped"].any()
+
+
+@pytest.mark.slow  # tests of the actuators have stops with and without the controller
+def test_the_front_axle_locks_first(entry):
+    front, rear = stop(motion_laws.driver({**entry, "abs": False}, slippery=0.125, width=4, **RATES))
+    assert (front >= 0.0).all() and ((rear < 0.0) | (rear > front)).all()
 
 
 def test_the_brakes_limit_solves_its_equation(car):

@@ -34,7 +34,7 @@ def made() -> Recording:
     settings = hydra_config.load_config("train", "experiment=smoke", "termination=goal_only", "timing.episode_s=10")
     starts, goals = np.array([[-20.0, 0.0], [-40.0, 0.0], [-50.0, -3.0]]), np.array([[-8.0, 0.0], [50.0, 0.0], [55.0, -3.0]])
     scenes = [scene_of(starts, goals, speeds=[8.0, 12.0, 5.0]), scene_of(starts[::-1], goals[::-1], speeds=[5.0, 12.0, 8.0])]
-    scene = jax.tree.map(lambda *leaves: jnp.stack(leaves), *scenes)
+    scene = jax.device_put(jax.tree.map(lambda *leaves: np.stack(leaves), *scenes))
     turn = jnp.array([[0.3, 0.0, 0.0], [0.6, 0.35, -0.2], [0.1, 0.0, 0.0]])
     act = lambda parameters, observation, key: turn + 0.02 * jax.random.normal(key, (3, 3))  # noqa: E731
     return _dressed(jax.device_get(record(environment.make_env(settings), act, None, scene, jax.random.key(3), steps=STEPS)))

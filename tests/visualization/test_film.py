@@ -20,6 +20,8 @@ from scenefactory_jax.visualization.mujoco.film import Camera, FilmSettings
 from scenefactory_jax.visualization.mujoco.offscreen_renderer import OpenGLError
 from scenefactory_jax.visualization.video_file import VideoError
 
+pytestmark = pytest.mark.usefixtures("quickly")
+
 CAR = cars.read_parameters(hydra_config.load_config("task")["dynamics"])[0]
 VIEW = hydra_config.load_config("view")
 SETTINGS = dataclasses.replace(FilmSettings(**VIEW["film"]), width=320, height=180)

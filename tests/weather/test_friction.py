@@ -18,6 +18,8 @@ from scenefactory_jax.core.types import SURFACES
 from scenefactory_jax.weather import friction, road_condition
 from scenefactory_jax.weather.friction import make_uniform
 
+pytestmark = pytest.mark.usefixtures("quickly")
+
 CONF = ROOT / "conf" / "weather"
 BASE = yaml.safe_load((CONF / "base.yaml").read_text())
 TYRE = schema.read(BASE["friction"]["tyre"], friction.Tyre, where="tyre")
