@@ -104,7 +104,7 @@ def pack(
     starts: dict[str, Any] | None,
     conflicts: Conflicts | None,
     controls: ControlsConfig,
-    elevation: ElevationConfig | None,
+    elevation: ElevationConfig | None = None,  # runs of before have none
 ) -> tuple[Scene, PackReport]:
     """Packs a checked scene into numpy leaves of its own size, without padding but absent agent slots.
 

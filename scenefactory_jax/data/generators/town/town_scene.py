@@ -56,7 +56,7 @@ def generate(
     warmup_s: NonNegative,
     max_sdc_distance_m: Positive,
     sensor_range_m: Positive,
-    hills: Hills | None,
+    hills: Hills | None = None,  # runs of before have none
 ) -> RawScene:
     """Generates scene `index` of the series `seed`: a road network, traffic lights and simulated traffic.
 
