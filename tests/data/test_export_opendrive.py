@@ -62,7 +62,10 @@ def test_a_town_comes_back_with_its_lanes_and_links(tmp_path, readers, index):
     require_same_map(raw, again, ids)
     root = load(tmp_path / "map.xodr", "OpenDRIVE", element_limit=10**6, file_limit_mb=64)
     inside = {road.get("id") for road in root.all("road") if road.get("junction") != "-1"}
-    connected = {entry.get("connectingRoad") for entry in root.walk("junction", "connection")}
+    common = [junction for junction in root.all("junction") if junction.get("type", "default") == "default"]
+    connected = {entry.get("connectingRoad") for junction in common for entry in junction.all("connection")}
+    named = {road.get("junction") for road in root.all("road")} - {"-1"}
+    assert named == {junction.get("id") for junction in common}
     assert inside and connected == inside  # roads of junctions are those that connect others
     controlled = {entry.get("signalId") for entry in root.walk("controller", "control")}
     assert controlled == {s.get("id") for road in root.all("road") for s in road.walk("signals", "signal") if s.get("dynamic") == "yes"}

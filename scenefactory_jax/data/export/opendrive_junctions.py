@@ -119,12 +119,14 @@ def _join(pairs: Sequence[tuple[tuple, tuple]]) -> dict[tuple, int]:
 
 
 def _find_connecting(members: dict[int, tuple[set[int], set[int]]], joint: dict[tuple, int], candidates: set[int]) -> set[int]:
-    """The connecting roads: those with one road at most at either end, of which one parts or meets there, as all beside it at a joint."""
+    """The connecting roads: those with one road before and one at most behind, where roads part or meet, as all beside it at a joint."""
     connecting = set()
     for road in candidates:
         start, end = joint.get(("start", road)), joint.get(("end", road))
-        single = (start is None or len(members[start][0]) == 1) and (end is None or len(members[end][1]) == 1)
-        shared = (start is not None and len(members[start][1]) > 1) or (end is not None and len(members[end][0]) > 1)
+        if start is None:  # a connection names the road before it
+            continue
+        single = len(members[start][0]) == 1 and (end is None or len(members[end][1]) == 1)
+        shared = len(members[start][1]) > 1 or (end is not None and len(members[end][0]) > 1)
         if single and shared:
             connecting.add(road)
     while True:
