@@ -60,7 +60,26 @@ def nearest_lane(position: Float[Array, "A 2"], lanes: Road) -> Int[Array, " A"]
 def squared_edge_distance(circles: Float[Array, "A C 2"], edges: Road, *, half_width_m: float) -> Float[Array, " A"]:
     """Smallest squared distance between the circles' centres of each agent and the valid segments, as rectangles."""
     distances = [squared_segment_distance(circles[:, index], edges, half_width_m=half_width_m) for index in range(circles.shape[1])]
-    return jnp.min(jnp.where(edges.valid, functools.reduce(jnp.minimum, distances), jnp.inf), axis=1, initial=jnp.inf)
+    return take_smallest(jnp.where(edges.valid, functools.reduce(jnp.minimum, distances), jnp.inf))
+
+
+@jax.custom_jvp
+def take_smallest(values: Float[Array, "A P"]) -> Float[Array, " A"]:
+    """Computes the smallest value of each row; its derivative is that of the first one.
+
+    JAX's own compares the values with the result, and is 0 / 0 where XLA has rounded the two differently.
+    """
+    return jnp.min(values, axis=1, initial=jnp.inf)
+
+
+@take_smallest.defjvp
+def _(primals: tuple, tangents: tuple) -> tuple:
+    (values,), (tangent,) = primals, tangents
+    smallest = take_smallest(values)
+    if values.shape[1] == 0:
+        return smallest, jnp.zeros_like(smallest)
+    first = jnp.argmin(values, axis=1)
+    return smallest, jnp.take_along_axis(tangent, first[:, None], axis=1)[:, 0]
 
 
 def squared_segment_distance(point: Float[Array, "A 2"], segments: Road, *, half_width_m: float) -> Float[Array, "A P"]:
@@ -97,7 +116,7 @@ def edge_rate(
         return jnp.where(ahead & (touches | (closing > SMALLEST)), inverse_ttc, 0.0)
 
     rates = functools.reduce(jnp.maximum, [rate(circles[:, index]) for index in range(circles.shape[1])])
-    return jnp.max(rates, axis=1, initial=0.0)
+    return jnp.maximum(-take_smallest(-rates), 0.0)
 
 
 def gather_segments(

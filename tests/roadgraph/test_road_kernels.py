@@ -12,6 +12,7 @@ from scenefactory_jax.core.pytree import replace, unchecked
 from scenefactory_jax.data.loading import scene_source
 from scenefactory_jax.roadgraph import queries, road_kernels, spatial_grid
 
+pytestmark = pytest.mark.usefixtures("quickly")
 CARS = 24
 EDGES = {"half_width_m": 0.05, "range_m": 40.0}
 ROWS = {"radius_m": 10.0, "kind_scale": 20.0}
