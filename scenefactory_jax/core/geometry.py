@@ -1,5 +1,6 @@
 """Planar geometry: angles, frames, the three circles that stand for a car, points along lanes."""
 
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
@@ -39,6 +40,30 @@ def safe_sqrt(squared: Float[Array, "*n"]) -> Float[Array, "*n"]:
     """Computes the square root; its gradient at zero is zero instead of NaN. NaN stays NaN."""
     zero = squared <= 0
     return jnp.where(zero, 0.0, jnp.sqrt(jnp.where(zero, 1.0, squared)))
+
+
+@jax.custom_jvp
+def take_smallest(values: Float[Array, "*n m"]) -> Float[Array, "*n"]:
+    """Computes the smallest value of the last axis, inf without any; its derivative is that of the first one.
+
+    JAX's own compares the values with the result, and is 0 / 0 where XLA has rounded the two differently.
+    """
+    return jnp.min(values, axis=-1, initial=jnp.inf)
+
+
+@take_smallest.defjvp
+def _(primals: tuple, tangents: tuple) -> tuple:
+    (values,), (tangent,) = primals, tangents
+    smallest = take_smallest(values)
+    if values.shape[-1] == 0:
+        return smallest, jnp.zeros_like(smallest)
+    first = jnp.argmin(values, axis=-1, keepdims=True)
+    return smallest, jnp.take_along_axis(tangent, first, axis=-1)[..., 0]
+
+
+def take_largest(values: Float[Array, "*n m"]) -> Float[Array, "*n"]:
+    """Computes the largest value of the last axis, -inf without any, with the derivative of `take_smallest`."""
+    return -take_smallest(-values)
 
 
 def dot(a: Float[Array, "*n d"], b: Float[Array, "*m d"]) -> Float[Array, "*k"]:

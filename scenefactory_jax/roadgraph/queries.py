@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from scenefactory_jax.core.geometry import SMALLEST, cross, dot, heading_vector, safe_sqrt, to_frame
+from scenefactory_jax.core.geometry import SMALLEST, cross, dot, heading_vector, safe_sqrt, take_largest, take_smallest, to_frame
 from scenefactory_jax.core.pallas import on_gpu
 from scenefactory_jax.core.types import Road, Scene, SetObservation, SpatialGrid
 from scenefactory_jax.roadgraph import road_kernels, spatial_grid
@@ -63,25 +63,6 @@ def squared_edge_distance(circles: Float[Array, "A C 2"], edges: Road, *, half_w
     return take_smallest(jnp.where(edges.valid, functools.reduce(jnp.minimum, distances), jnp.inf))
 
 
-@jax.custom_jvp
-def take_smallest(values: Float[Array, "A P"]) -> Float[Array, " A"]:
-    """Computes the smallest value of each row; its derivative is that of the first one.
-
-    JAX's own compares the values with the result, and is 0 / 0 where XLA has rounded the two differently.
-    """
-    return jnp.min(values, axis=1, initial=jnp.inf)
-
-
-@take_smallest.defjvp
-def _(primals: tuple, tangents: tuple) -> tuple:
-    (values,), (tangent,) = primals, tangents
-    smallest = take_smallest(values)
-    if values.shape[1] == 0:
-        return smallest, jnp.zeros_like(smallest)
-    first = jnp.argmin(values, axis=1)
-    return smallest, jnp.take_along_axis(tangent, first[:, None], axis=1)[:, 0]
-
-
 def squared_segment_distance(point: Float[Array, "A 2"], segments: Road, *, half_width_m: float) -> Float[Array, "A P"]:
     """Squared distance of each point from each segment, valid or not, as a rectangle of that half width; 0 inside."""
     offset = point[:, None] - segments.midpoint
@@ -116,7 +97,7 @@ def edge_rate(
         return jnp.where(ahead & (touches | (closing > SMALLEST)), inverse_ttc, 0.0)
 
     rates = functools.reduce(jnp.maximum, [rate(circles[:, index]) for index in range(circles.shape[1])])
-    return jnp.maximum(-take_smallest(-rates), 0.0)
+    return jnp.maximum(take_largest(rates), 0.0)
 
 
 def gather_segments(

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from scenefactory_jax.core.boxes import compute_corners
-from scenefactory_jax.core.geometry import cover_with_circles, cross, dot, heading_vector, safe_norm, to_frame
+from scenefactory_jax.core.geometry import cover_with_circles, cross, dot, heading_vector, safe_norm, take_largest, take_smallest, to_frame
 from scenefactory_jax.core.pytree import replace
 from scenefactory_jax.core.types import DRIVABLE, Road, Scene
 from scenefactory_jax.evaluation.adversary.kinematics import Track
@@ -39,7 +39,8 @@ def cover(track: Track, size: Float[Array, "*n 2"]) -> Bodies:
 def compute_clearance(one: Bodies, other: Bodies) -> Float[Array, "*n T"]:
     """Computes the clearances of bodies at equal times; leading axes broadcast."""
     apart = one.centres[..., :, None, :] - other.centres[..., None, :, :]
-    return jnp.min(safe_norm(apart), axis=(-2, -1)) - (one.radius + other.radius)[..., None]
+    distance = safe_norm(apart)
+    return take_smallest(distance.reshape(*distance.shape[:-2], -1)) - (one.radius + other.radius)[..., None]
 
 
 def compute_approach(clearance: Float[Array, "K T"], counted: Bool[Array, "K T"], *, soft_m: float, depth_m: float) -> Float[Array, ""]:
@@ -57,7 +58,7 @@ def compute_repulsion(
 ) -> Float[Array, ""]:
     """Computes the sum over pairs, and the largest value in time, of the squared part of a margin that a pair lacks, m^2."""
     lacking = jnp.where(present, jnp.maximum(margin_m[..., None] - clearance, 0.0), 0.0)
-    return jnp.sum(jnp.max(lacking**2, axis=-1))
+    return jnp.sum(take_largest(lacking**2))
 
 
 class RoadShape(NamedTuple):
@@ -119,7 +120,7 @@ def compute_off_road(
         allowed: how far off the road the car's own log leads.
     """
     excess = jnp.where(present[..., None], jnp.maximum(outside - allowed[:, None, None] + margin_m, 0.0), 0.0)
-    return jnp.sum(jnp.max(excess**2, axis=1))
+    return jnp.sum(take_largest(jnp.swapaxes(excess, 1, 2) ** 2))
 
 
 def compute_change(change: Float[Array, "K T 2"]) -> Float[Array, ""]:
