@@ -86,7 +86,8 @@ def simulate(
     """Simulates all steps with constant accelerations within each step; `gates` are the states of stops and crosswalks.
 
     Args:
-        runs, turns: who does not stop at closed gates, and for whom they are as stop signs; None: nobody.
+        runs: road users that drive through closed gates; None: nobody.
+        turns: road users, and the gates that they treat as stop signs while closed; None: nobody.
     """
     simulation = Simulation(users, driver)
     simulation.runs = simulation.runs if runs is None else runs[:, None] | simulation.runs
