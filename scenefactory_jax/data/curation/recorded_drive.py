@@ -50,13 +50,11 @@ def _measure_off_road(track: Track, edges: list[Polyline]) -> float:
 
 def _count_overlaps(track: Track, others: list[Track], level_m: float) -> int:
     """Steps at which the track's box shares ground with another one."""
-    near = []
+    own, met = _place_boxes(track), np.zeros(len(track.valid), bool)
     for other in others:
         reach = (np.hypot(*track.size[:2]) + np.hypot(*other.size[:2])) / 2
-        both = track.valid & other.valid & (np.abs(track.xyz[:, 2] - other.xyz[:, 2]) < level_m)
-        near.append(both & (np.linalg.norm(track.xyz[:, :2] - other.xyz[:, :2], axis=1) < reach))
-    own, met = _place_boxes(track), np.zeros(len(track.valid), bool)
-    for other, steps in zip(others, near, strict=True):
-        if steps.any():
-            met[steps] |= overlaps(own[steps], _place_boxes(other)[steps])
+        near = track.valid & other.valid & (np.abs(track.xyz[:, 2] - other.xyz[:, 2]) < level_m)
+        near &= np.linalg.norm(track.xyz[:, :2] - other.xyz[:, :2], axis=1) < reach
+        if near.any():
+            met[near] |= overlaps(own[near], _place_boxes(other)[near])
     return int(met.sum())

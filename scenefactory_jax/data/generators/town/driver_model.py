@@ -90,8 +90,10 @@ def simulate(
         turns: road users, and the gates that they treat as stop signs while closed; None: nobody.
     """
     simulation = Simulation(users, driver)
-    simulation.runs = simulation.runs if runs is None else runs[:, None] | simulation.runs
-    simulation.turns = simulation.turns if turns is None else turns
+    if runs is not None:
+        simulation.runs[:] = runs[:, None]
+    if turns is not None:
+        simulation.turns[:] = turns
     log = []
     for step, now in enumerate(times):
         log.append((simulation.place, np.where(simulation.present, simulation.speed, 0.0), simulation.present))
