@@ -11,7 +11,7 @@ from scenefactory_jax.core.schema import read as read_settings
 from scenefactory_jax.data.loading import scene_source
 from scenefactory_jax.evaluation import protocols, records, statistics
 from scenefactory_jax.evaluation.settings import ScoreSettings
-from scenefactory_jax.learning import checkpoint, policy_io
+from scenefactory_jax.learning import checkpoint, run_paths
 
 REQUEST = "request.json"  # beside the tables of agents
 
@@ -58,7 +58,7 @@ def compose(asked: Asked) -> tuple[dict[str, Any], dict[str, Any]]:
     if asked.planner:
         own = [*found["planner_overrides"][planned], *protocol.get("planner_overrides", {}).get(planned, [])]
         return hydra_config.apply_overrides(hydra_config.load_config("train", "scenes=town", *words), own), found
-    return hydra_config.apply_overrides(hydra_config.read(policy_io.find(name)), words), found
+    return hydra_config.apply_overrides(hydra_config.read(run_paths.find(name)), words), found
 
 
 def _measure(asked: Asked) -> list[records.Records]:
@@ -67,5 +67,5 @@ def _measure(asked: Asked) -> list[records.Records]:
     scores = scores and read_settings(scores, ScoreSettings, where="protocol.scores")
     scenes = scene_source.load_heldout_scenes(config["scenes"], path=asked.scenes)
     evaluator = protocols.make_evaluator(config, scenes, settings=found, scores=scores)
-    parameters = [checkpoint.restore_parameters(policy_io.find(run) / "checkpoints") for run in asked.runs] or [{}]
+    parameters = [checkpoint.restore_parameters(run_paths.find(run) / "checkpoints") for run in asked.runs] or [{}]
     return [evaluator(tree) for tree in parameters]

@@ -23,7 +23,7 @@ from scenefactory_jax.core import config as run_config
 from scenefactory_jax.core import markdown, result_file
 from scenefactory_jax.data.loading import scene_source
 from scenefactory_jax.env import environment, rollout
-from scenefactory_jax.learning import checkpoint, policy_io
+from scenefactory_jax.learning import checkpoint, run_paths
 from scenefactory_jax.learning.training_loop import make_policy
 
 HERE = Path(__file__).parent
@@ -61,7 +61,7 @@ def drive(config: Mapping[str, Any], parameters: Any, scenes: scene_source.Scene
 
 def measure_run(run: str, given: argparse.Namespace) -> dict[str, np.ndarray]:
     """Measures one run; the worlds are numbers of the scenes."""
-    drives, parameters = [], checkpoint.restore_parameters(policy_io.find(run) / "checkpoints")
+    drives, parameters = [], checkpoint.restore_parameters(run_paths.find(run) / "checkpoints")
     for road in (ICE, DRY):
         asked = Asked((run,), None, ("protocol=ice_onset", f"protocol.mu={given.mu}"), (*given.overrides, *road), given.scenes)
         config, _ = evaluations.compose(asked)

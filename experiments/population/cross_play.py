@@ -22,7 +22,7 @@ from scenefactory_jax.core import config as run_config
 from scenefactory_jax.core import markdown, result_file
 from scenefactory_jax.data.loading import scene_source
 from scenefactory_jax.evaluation import statistics
-from scenefactory_jax.learning import policy_io
+from scenefactory_jax.learning import run_paths
 
 HERE = Path(__file__).parent
 SEEDS, CONDITIONED = "other_seeds", "conditioned"
@@ -40,10 +40,10 @@ SHOWN = ("clean_success_rate", "collision_rate")
 
 def find_traffic(background: str, run: str, seeds: list[str], conditioned: str | None) -> tuple[str, ...] | None:
     """Finds the overrides of a background for one of the runs of a name; None: there is none, as other seeds of a single run."""
-    others = ",".join(str(policy_io.find(other)) for other in seeds if other != run)
+    others = ",".join(str(run_paths.find(other)) for other in seeds if other != run)
     if (background == SEEDS and not others) or (background == CONDITIONED and conditioned is None):
         return None
-    return tuple(word.format(run=policy_io.find(run), others=others, conditioned=conditioned) for word in BACKGROUNDS[background])
+    return tuple(word.format(run=run_paths.find(run), others=others, conditioned=conditioned) for word in BACKGROUNDS[background])
 
 
 def evaluate(runs: list[str], background: str, given: argparse.Namespace) -> statistics.Runs:

@@ -26,7 +26,7 @@ from scenefactory_jax.evaluation.adversary.ego_drive import EGO, make_drive
 from scenefactory_jax.evaluation.adversary.kinematics import Track
 from scenefactory_jax.evaluation.adversary.settings import AttackSettings
 from scenefactory_jax.evaluation.scoring import STEP_S
-from scenefactory_jax.learning import checkpoint, policy_io
+from scenefactory_jax.learning import checkpoint, run_paths
 from scenefactory_jax.visualization.birds_eye.attack_figures import AttackedWorld
 from scenefactory_jax.visualization.mujoco import contact_replay
 from scenefactory_jax.visualization.report import attack_report
@@ -136,7 +136,7 @@ class Tasks:
         """The config of the ego's environment, and the parameters of its policy."""
         if self.config["run"] is None:
             return self.make_planner(self.config["planner"]), {}
-        run = policy_io.find(self.config["run"])
+        run = run_paths.find(self.config["run"])
         trained = configs.read(run, trust=self.config["trust"])
         task = configs.apply_overrides(trained, self.overrides)  # a policy drives the car that it knows
         return {**task, "termination": self.termination}, checkpoint.restore_parameters(run / "checkpoints")

@@ -18,7 +18,7 @@ from scenefactory_jax.data.loading import scene_source
 from scenefactory_jax.evaluation import circumstances, protocols
 from scenefactory_jax.evaluation.protocols import Evaluator
 from scenefactory_jax.evaluation.settings import ScoreSettings
-from scenefactory_jax.learning import checkpoint, policy_io
+from scenefactory_jax.learning import checkpoint, policy_io, run_paths
 from scenefactory_jax.learning.traffic_pool import PAST
 from scenefactory_jax.visualization.report import evaluation_files, planner_table, tables
 from scenefactory_jax.visualization.report.evaluation_files import Result
@@ -43,9 +43,9 @@ def evaluate(config: Mapping[str, Any]) -> Result:
         run, trained = None, configs.load_config("train", *ALONE, f"name={protocol['name']}", *overrides)
         home = Path("runs") / protocol["name"]
     else:
-        run = policy_io.find(config["run"])
+        run = run_paths.find(config["run"])
         trained = configs.apply_overrides(configs.read(run, trust=config["trust"]), overrides)
-        home = Path("runs") / run.name if policy_io.is_bundled(run) else run
+        home = Path("runs") / run.name if run_paths.is_bundled(run) else run
     schema.check_mu(trained)
     out = Path(config["out"] or home / "evaluation")
     request = {name: config[name] for name in ("run", "overrides", "trust")} | {"scenes": config["scenes"]["path"]}

@@ -40,7 +40,7 @@ def export(config: Mapping[str, Any]) -> Path:
     file = checkpoint.write_parameters(out / "checkpoints", trained.parameters)
     scenes = trained.config["scenes"]
     scenes = {**scenes, "path": None, "heldout": {**scenes["heldout"], "path": None}}  # without paths of this machine
-    exported = {**trained.config, "out": None, "resume": False, "scenes": scenes}
+    exported = {**trained.config, "out": None, "resume": False, "start_from": None, "scenes": scenes}
     run_config.write(out, exported)
     shutil.copy(trained.folder / "versions.yaml", out)
     text = policy_card.format_card(

@@ -98,6 +98,7 @@ class Train(Task):
     name: str
     out: str | None
     resume: bool
+    start_from: str | None
     seed: Seed
     worlds: Count
     devices: Count | None

@@ -20,7 +20,7 @@ from scenefactory_jax.data.packing import road_patches
 from scenefactory_jax.evaluation import friction_search
 from scenefactory_jax.evaluation.friction_search import SearchResult, SearchSettings
 from scenefactory_jax.evaluation.settings import Failures
-from scenefactory_jax.learning import checkpoint, policy_io
+from scenefactory_jax.learning import checkpoint, run_paths
 from scenefactory_jax.visualization.report import friction_search_report
 
 WEATHER = "weather=scene"  # after all overrides: the road is dry but for the slick
@@ -100,9 +100,9 @@ def _load_task(config: Mapping[str, Any]) -> tuple[dict[str, Any], Path | None, 
         trained, home = configs.load_config("train", *ALONE, f"name={name}", *settings), Path("runs") / name
         settings = [*settings, *known[name], *protocol.get("planner_overrides", {}).get(name, [])]
     else:
-        run = policy_io.find(config["run"])
+        run = run_paths.find(config["run"])
         trained = configs.read(run, trust=config["trust"])
-        home = Path("runs") / run.name if policy_io.is_bundled(run) else run
+        home = Path("runs") / run.name if run_paths.is_bundled(run) else run
     task = configs.apply_overrides(trained, [*settings, *config["overrides"], WEATHER, f"weather.hidden={str(config['hidden']).lower()}"])
     if task["scenes"]["pack"]["agents"] != 1:
         raise ConfigError(f"scenes.pack.agents: expected 1, the agent that is to fail, got {task['scenes']['pack']['agents']}")

@@ -16,7 +16,7 @@ from scenefactory_jax.core.instantiate import ConfigError
 from scenefactory_jax.data.bank import bank_index
 from scenefactory_jax.data.formats import reader_selection
 from scenefactory_jax.env import environment
-from scenefactory_jax.learning import policy_io
+from scenefactory_jax.learning import run_paths
 
 TASK = tuple(group for group in environment.GROUPS if group != "termination")  # the termination is the protocol's
 LEARNER = (*TASK, "termination", "policy", "learner", "ppo", "devices")  # groups that the compiled training depends on
@@ -296,7 +296,7 @@ def _plan_policy(config: Mapping[str, Any], row: str, protocols: Mapping[str, Co
     """The evaluations of a policy that the study does not train, on the study's held-out scenes."""
     entry = config["study"]["policies"][row]
     try:
-        folder = policy_io.find(entry["run"])
+        folder = run_paths.find(entry["run"])
         settings = run_config.read(folder)
     except ConfigError as error:
         raise ConfigError(f"study.policies.{row}: {error}") from None

@@ -16,7 +16,7 @@ from scenefactory_jax.core.schema import Bounds, Count, Seed
 from scenefactory_jax.data.loading import scene_source
 from scenefactory_jax.dynamics.articulated import parameters as cars
 from scenefactory_jax.env import environment
-from scenefactory_jax.learning import policy_io
+from scenefactory_jax.learning import run_paths
 from scenefactory_jax.visualization import recorded_episodes, rerun_file, video_file
 from scenefactory_jax.visualization.mujoco import exported_world, film, keyboard_control, offscreen_renderer
 from scenefactory_jax.visualization.mujoco.film import Camera, FilmSettings
@@ -160,7 +160,7 @@ def load_run_config(config: Mapping[str, Any]) -> dict[str, Any]:
     for group in environment.GROUPS:
         if config[group] != plain[group]:
             raise ConfigError(f"{group}: decided by the run {config['run']}; to change it: overrides='[{group}=...]'")
-    trained = configs.apply_overrides(configs.read(policy_io.find(config["run"]), trust=config["trust"]), config["overrides"])
+    trained = configs.apply_overrides(configs.read(run_paths.find(config["run"]), trust=config["trust"]), config["overrides"])
     scenes, requested, default = trained["scenes"], config["scenes"], plain["scenes"]
     if requested["path"] is not None:
         return trained | {"scenes": scenes | {"path": requested["path"]}}

@@ -20,7 +20,8 @@ from scenefactory_jax.core import distributed, sharding
 from scenefactory_jax.core.atomic_file import write_atomically
 from scenefactory_jax.core.schema import ConfigError
 
-PARAMETERS, AVERAGED = "parameters/", "ema_parameters/"  # paths of arrays begin with these
+PARAMETERS, AVERAGED, LEARNT = "parameters/", "ema_parameters/", "learner/"  # paths of arrays begin with these
+NETWORK = "/params/"  # behind the path of a network
 HOST = "host"  # JSON text of the values that the training loop adds
 FILE = "policy.npz"  # in place of checkpoints: parameters alone
 Arrays = dict[str, np.ndarray]
@@ -114,6 +115,38 @@ def restore_parameters(folder: Path | str, iteration: int | None = None) -> Any:
         averaged, last = _load(file, AVERAGED), _load(file, PARAMETERS)
         arrays = {name.partition("/")[2]: value for name, value in (averaged or last).items()}
     return jax.device_put(unflatten_dict(arrays, sep="/"), may_alias=False)  # copied; `jnp.array` would compile a program for every shape
+
+
+def put_networks(folder: Path | str, state: Any) -> tuple[Any, list[str]]:
+    """Puts networks of the newest checkpoint into a new train state, for a training that starts from them.
+
+    The policy's are those that `restore_parameters` reads. Of what else the algorithm learns (critics, target networks), a network is taken
+    if all of its arrays fit. Optimizers start anew, and numbers beside the networks (alpha) stay as the config has them.
+
+    Args:
+        state: a new `trainer.init(...)`.
+
+    Returns:
+        The train state, and the paths of the networks that were taken.
+
+    Raises:
+        ConfigError: the policy's parameters do not fit, the message names the arrays that differ. Otherwise as `restore`.
+    """
+    leaves, begin = _name_leaves(state), str.startswith
+    policy = {f"{PARAMETERS}{name}": np.asarray(leaf) for name, leaf in _name_leaves(restore_parameters(folder)).items()}
+    _check_same_arrays(policy, {name: leaf for name, leaf in leaves.items() if begin(name, PARAMETERS)}, Path(folder))
+    found = {} if (Path(folder) / FILE).is_file() else _load(_find(folder, None), LEARNT)
+    describe = lambda arrays, path: {name: (leaf.shape, leaf.dtype) for name, leaf in arrays.items() if begin(name, path)}  # noqa: E731
+    paths = sorted({name.partition(NETWORK)[0] + NETWORK for name in leaves if begin(name, LEARNT) and NETWORK in name})
+    taken = [path for path in paths if describe(found, path) == describe(leaves, path)]
+    chosen = policy | {name: leaf for name, leaf in found.items() if begin(name, tuple(taken))}
+    for name, value in policy.items():
+        if (averaged := name.replace(PARAMETERS, AVERAGED, 1)) in leaves:
+            chosen[averaged] = value
+        if (past := f"past/{name}") in leaves:  # the window over past policies has this one first
+            chosen[past] = np.asarray(leaves[past].at[0].set(value))
+    placed = [_place(chosen[name], leaf) if name in chosen else leaf for name, leaf in leaves.items()]
+    return jax.tree.unflatten(jax.tree.structure(state), placed), [PARAMETERS, *taken]
 
 
 def write_parameters(folder: Path | str, parameters: Any) -> Path:

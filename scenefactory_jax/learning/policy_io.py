@@ -9,13 +9,10 @@ import jax.numpy as jnp
 from jaxtyping import PRNGKeyArray
 
 from scenefactory_jax.core import config as configs
-from scenefactory_jax.core.instantiate import ConfigError
 from scenefactory_jax.core.types import Policy, Scene
 from scenefactory_jax.env import environment
-from scenefactory_jax.learning import checkpoint, trainer
+from scenefactory_jax.learning import checkpoint, run_paths, trainer
 from scenefactory_jax.learning.training_loop import make_policy
-
-SHIPPED = Path(__file__).resolve().parent.parent / "pretrained"
 
 
 class TrainedPolicy(NamedTuple):
@@ -38,7 +35,7 @@ def load_policy(run: str | Path, *, trust: bool = False) -> TrainedPolicy:
         run: a folder that `train` or `export` wrote, or the name of a policy that comes with the package; else a ConfigError.
         trust: whether its config may name functions outside of the package, which are then imported and called; else a ConfigError.
     """
-    folder = find(run)
+    folder = run_paths.find(run)
     config = configs.read(folder, trust=trust)
     return TrainedPolicy(folder, config, make_policy(config), checkpoint.restore_parameters(folder / "checkpoints"))
 
@@ -58,19 +55,3 @@ def draw_untrained(config: Mapping[str, Any], scene: Scene) -> Any:
         return trainer.init_parameters(key, policy, blank)
 
     return draw(key)
-
-
-def find(run: str | Path) -> Path:
-    """Finds the folder of a run, or of a policy that comes with the package by its name; a ConfigError lists these."""
-    if (Path(run) / configs.FILE).is_file():
-        return Path(run)
-    shipped = {folder.parent.name: folder.parent for folder in sorted(SHIPPED.glob(f"*/{configs.FILE}"))}
-    if str(run) in shipped:
-        return shipped[str(run)]
-    bundled = f", or a bundled policy: {', '.join(shipped)}" if shipped else ""
-    raise ConfigError(f"run: {configs.FILE} not found in {run}; expected a folder that `train` or `export` wrote{bundled}")
-
-
-def is_bundled(folder: Path) -> bool:
-    """Whether a policy comes with the package, whose folder must not be written to."""
-    return folder.parent == SHIPPED

@@ -21,7 +21,7 @@ LOG = logging.getLogger(__name__)
 MAX_LETTERS = 80  # of a sweep's changes in the name of a folder
 # Keys that may change when a run is resumed, with all below them
 FREE = ("out", "resume", "progress", "name", "iterations", "minutes", "checkpoint_every", "checkpoints_kept", "devices", "scenes.workers")
-FREE += ("loggers", "evaluation", "scenes.heldout", "distributed")
+FREE += ("loggers", "evaluation", "scenes.heldout", "distributed", "start_from")
 
 
 @contextlib.contextmanager

@@ -18,7 +18,7 @@ from scenefactory_jax.core.instantiate import ConfigError, instantiate, resolve_
 from scenefactory_jax.core.types import Env, Policy, Scene
 from scenefactory_jax.data.loading import scene_source, stream
 from scenefactory_jax.env import environment
-from scenefactory_jax.learning import checkpoint, interrupt, past_policies, run_folder, sample_stream
+from scenefactory_jax.learning import checkpoint, interrupt, past_policies, run_folder, run_paths, sample_stream
 from scenefactory_jax.learning.networks import late_fusion
 from scenefactory_jax.learning.ppo import train_iteration as ppo
 from scenefactory_jax.learning.sample_stream import SampleStream
@@ -111,6 +111,9 @@ def train(
             if resume:
                 state = checkpoint.restore(folder / "checkpoints", state)
                 LOG.info(f"resumed at iteration {int(state.iteration)}")
+            elif config["start_from"] is not None:
+                state, taken = checkpoint.put_networks(run_paths.find(config["start_from"], key="start_from") / "checkpoints", state)
+                LOG.info(f"starts from {config['start_from']}: {', '.join(path.strip('/') for path in taken)}")
             before = before and before.get("samples")
             samples = stack.enter_context(sample_stream.open_stream(config, trainer, state, mesh=prepared.mesh, before=before))
             first = int(state.iteration) if resume else None

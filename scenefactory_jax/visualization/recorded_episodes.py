@@ -18,7 +18,7 @@ from scenefactory_jax.data.packing.pack import Packed, prepare
 from scenefactory_jax.data.packing.stack import stack
 from scenefactory_jax.env import environment
 from scenefactory_jax.env.rollout import Act, Recording, record
-from scenefactory_jax.learning import checkpoint, policy_io
+from scenefactory_jax.learning import checkpoint, run_paths
 from scenefactory_jax.learning.training_loop import make_policy
 from scenefactory_jax.visualization.web.road_posts import RoadPosts, find_posts
 
@@ -78,7 +78,7 @@ def select_policy(settings: Mapping[str, Any], *, run: str | None, act: str, slo
     """
     if act == "policy" and run is not None:
         policy = make_policy(settings)
-        parameters = checkpoint.restore_parameters(policy_io.find(run) / "checkpoints")
+        parameters = checkpoint.restore_parameters(run_paths.find(run) / "checkpoints")
         return lambda parameters, observation, key: policy.apply(parameters, observation)[0], parameters
     if act == "random":
         return lambda parameters, observation, key: jax.random.uniform(key, (slots, 3), jnp.float32, -1.0, 1.0), None

@@ -181,6 +181,22 @@ def test_a_killed_and_resumed_run_is_the_unbroken_one(whole, prepared, tmp_path)
     jax.tree.map(np.testing.assert_array_equal, resumed.state.parameters, whole.state.parameters)
 
 
+def test_a_run_starts_from_the_networks_of_another(whole, prepared, tmp_path):
+    trained = checkpoint.restore_parameters(whole.folder / "checkpoints")
+    seen = []
+
+    def iterate(state, scenes):
+        seen.append(jax.device_get(state.parameters))
+        return prepared.trainer.train_iteration(state, scenes)
+
+    settings = smoke(tmp_path / "tuned", "iterations=1", "evaluation.enable=false", f"start_from={whole.folder}")
+    train(settings, prepared=prepared._replace(trainer=prepared.trainer._replace(train_iteration=iterate)))
+    jax.tree.map(np.testing.assert_array_equal, seen, [trained])
+    with pytest.raises(ConfigError, match=r"^start_from: config.yaml not found in nowhere; expected a folder that"):
+        train(smoke(tmp_path / "refused", "start_from=nowhere"), prepared=prepared)
+    assert not (tmp_path / "refused").exists()
+
+
 def contents(folder: Path) -> dict[str, bytes]:
     return {str(path.relative_to(folder)): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
 

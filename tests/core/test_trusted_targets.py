@@ -14,7 +14,7 @@ from scenefactory_jax.cli.view import load_run_config, replay
 from scenefactory_jax.core import config as run_config
 from scenefactory_jax.core import trusted_targets
 from scenefactory_jax.core.instantiate import ConfigError
-from scenefactory_jax.learning import policy_io, run_folder
+from scenefactory_jax.learning import run_folder, run_paths
 from scenefactory_jax.visualization.report import policy_card
 
 PLANTED = (
@@ -34,7 +34,7 @@ FOREIGN += ["scenefactory_jax_evil.rewards.event", ".planted.make", 7]
 @pytest.fixture
 def folder(tmp_path, monkeypatch):
     """The package's policy in a folder with a module beside it, importable from where the command is called."""
-    shutil.copytree(policy_io.SHIPPED / "town", tmp_path / "theirs")
+    shutil.copytree(run_paths.SHIPPED / "town", tmp_path / "theirs")
     (tmp_path / "theirs" / "planted.py").write_text(PLANTED)
     monkeypatch.chdir(tmp_path / "theirs")
     monkeypatch.syspath_prepend(tmp_path / "theirs")
@@ -95,7 +95,7 @@ def test_trusted_targets_are_named_and_run(folder, tmp_path, capsys):
 
 def test_a_policy_of_the_package_needs_no_trust(capsys):
     assert trusted_targets.find_outside_targets(sf.load_policy("town").config) == {} and capsys.readouterr().out == ""
-    assert policy_card._describe_code(()) in (policy_io.SHIPPED / "town" / "README.md").read_text()
+    assert policy_card._describe_code(()) in (run_paths.SHIPPED / "town" / "README.md").read_text()
 
 
 def test_all_targets_of_the_configs_are_inside():

@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from flax import traverse_util
 from support.probes import SMALL, make_trainer, probe, scenes
 
 from scenefactory_jax.core.instantiate import ConfigError
@@ -245,3 +246,42 @@ def test_values_of_the_host_are_saved_with_it(saved, tmp_path):
     checkpoint.save(tmp_path, fourth, keep=2)
     assert checkpoint.restore_host(tmp_path, 3) == host and checkpoint.restore_host(tmp_path) is None
     assert_same(checkpoint.restore(tmp_path, third, 3), third)
+
+
+def test_a_new_training_starts_from_the_networks_of_another(trainer, saved):
+    folder, third, _ = saved
+    new = trainer.init(jax.random.key(9), scenes(STAGE))
+    started, taken = checkpoint.put_networks(folder, new)
+    assert taken == ["parameters/"]
+    assert_same(started.parameters, third.ema_parameters)  # those that an evaluation reads
+    assert_same(started.ema_parameters, third.ema_parameters)
+    assert_same((started.optimizer, started.worlds, started.key, started.steps), (new.optimizer, new.worlds, new.key, new.steps))
+    trainer.train_iteration(started, scenes(STAGE))  # the same program, and no array is another's
+    with pytest.raises(ConfigError, match=r"does not fit this config: parameters/mean: it has \(2,\) float32, the config expects none"):
+        checkpoint.put_networks(_write(folder.parent / "other", {"parameters/mean": np.zeros(2, np.float32)}), new)
+
+
+def test_critics_are_taken_if_they_fit_and_numbers_never(tmp_path):
+    ones = {name: np.ones(shape, np.float32) for name, shape in SHAPES.items()}
+    folder = _write(tmp_path, ones | {"learner/target/params/kernel": np.ones(4, np.float32)})
+    nested = traverse_util.unflatten_dict({name: jnp.zeros(shape) for name, shape in SHAPES.items()}, sep="/")
+    started, taken = checkpoint.put_networks(folder, nested)
+    assert taken == ["parameters/", "learner/critics/params/"]
+    values = {name: float(leaf.max()) for name, leaf in traverse_util.flatten_dict(started, sep="/").items()}
+    assert values == dict.fromkeys(SHAPES, 1.0) | {"learner/target/params/kernel": 0.0, "learner/log_alpha": 0.0}
+    np.testing.assert_array_equal(started["past"]["parameters"]["params"]["bias"][:, 0], [1.0, 0.0])
+
+
+SHAPES = {
+    "parameters/params/bias": (3,),
+    "learner/critics/params/kernel": (2,),
+    "learner/target/params/kernel": (2,),
+    "learner/log_alpha": (),
+    "past/parameters/params/bias": (2, 3),
+}
+
+
+def _write(folder, arrays):
+    folder.mkdir(exist_ok=True)
+    np.savez(folder / "7.npz", **arrays)
+    return folder

@@ -8,10 +8,10 @@ from support.running import ROOT
 import scenefactory_jax as sf
 from scenefactory_jax.cli import hydra_config
 from scenefactory_jax.evaluation.metrics import agent_metrics
-from scenefactory_jax.learning import policy_io
+from scenefactory_jax.learning import run_paths
 
-SHIPPED = [file.parent for file in sorted(policy_io.SHIPPED.glob("*/config.yaml"))]
-TOWN = policy_io.SHIPPED / "town" / "README.md"
+SHIPPED = [file.parent for file in sorted(run_paths.SHIPPED.glob("*/config.yaml"))]
+TOWN = run_paths.SHIPPED / "town" / "README.md"
 
 
 @pytest.mark.parametrize("folder", SHIPPED, ids=lambda folder: folder.name)
@@ -50,7 +50,7 @@ def test_figures_of_the_readme_are_those_of_the_card():
 
 
 def test_the_readme_says_what_the_card_of_drive_does():
-    card = (policy_io.SHIPPED / "drive" / "README.md").read_text()
+    card = (run_paths.SHIPPED / "drive" / "README.md").read_text()
     lines = [line for line in card.splitlines() if line.startswith(("| Driven", "| 64 generated"))]
     header, row = ([cell.strip() for cell in line.split("|")] for line in lines)
     said = " ".join((ROOT / "README.md").read_text().split())
