@@ -5,7 +5,6 @@ Positions are projected by the transverse Mercator projection of UTM (Krüger's 
 INTERACTION's, and to the first point for others; `local_x` and `local_y` of a point go before.
 """
 
-import re
 from collections import defaultdict
 from collections.abc import Iterator, Mapping
 from pathlib import Path
@@ -34,8 +33,6 @@ MARKS = {  # subtype of a line -> WOMD's white and yellow road line
 PHYSICAL = ("curbstone", "road_border", "guard_rail", "wall", "fence", "jersey_barrier")  # lines that bound the road
 LINES = ("line_thin", "line_thick")
 STOP_SIGNS = ("usR1-1", "de206")
-LIMIT = re.compile(r"([\d.]+)\s*(mph|km/h|kmh|m/s|mps)?")
-UNITS = {"mph": 1609.344 / 3600, "m/s": 1.0, "mps": 1.0}
 AROUND_ZERO_DEG = 0.5  # a map nearer to (0, 0) is in local metres
 OVERLAP_M2 = 1.0  # lanelets that share more area meet in a junction
 
@@ -100,7 +97,7 @@ def read_map(path: Path, *, point_spacing_m: float, outline: OutlineNumbers, ele
     if not shapes:
         raise SceneError(f"{path}: expected relations of the type lanelet for cars, got {len(relations)} others")
     ids = {number: place for place, number in enumerate(shapes)}
-    lanelets = _make_lanelets(shapes, ids, relations)
+    lanelets = _make_lanelets(shapes, ids, relations, ways)
     inside = _find_junctions(lanelets)
     bounds = {frozenset(way.ids) for borders in shapes.values() for way in borders}
     lines = [way for way in ways.values() if len(way.ids) > 1]
@@ -190,7 +187,9 @@ def _turn_to_road(lines: list[Points], lanelets: Mapping[int, Lanelet], spacing_
     return turned
 
 
-def _make_lanelets(shapes: Mapping[str, tuple[_Way, _Way]], ids: Mapping[str, int], relations: Mapping[str, Element]) -> dict[int, Lanelet]:
+def _make_lanelets(
+    shapes: Mapping[str, tuple[_Way, _Way]], ids: Mapping[str, int], relations: Mapping[str, Element], ways: Mapping[str, _Way]
+) -> dict[int, Lanelet]:
     """The lanelets with links by shared ends, and neighbours by shared borders that may be crossed."""
     begins, ends, lefts, rights = (defaultdict(list) for _ in range(4))
     for number, (left, right) in shapes.items():
@@ -210,7 +209,7 @@ def _make_lanelets(shapes: Mapping[str, tuple[_Way, _Way]], ids: Mapping[str, in
             exit=tuple(begins[left.ids[-1], right.ids[-1]]),
             beside_left=tuple(rights[left.ids]) if _is_crossed(left, "right") else (),
             beside_right=tuple(lefts[right.ids]) if _is_crossed(right, "left") else (),
-            limit=_find_limit(relations[number], tags, relations),
+            limit=_find_limit(relations[number], tags, relations, ways),
             marks=tuple(mark for way in (left, right) if (mark := _find_mark(way)) is not None),
         )
     return lanelets
@@ -236,14 +235,15 @@ def _list_elements(record: Element, relations: Mapping[str, Element], subtype: s
     return [(element, tags) for element in found if element is not None and (tags := _read_tags(element)).get("subtype") == subtype]
 
 
-def _find_limit(record: Element, tags: Mapping[str, str], relations: Mapping[str, Element]) -> float | None:
-    """The speed limit of a lanelet, m/s; numbers without a unit are km/h."""
-    texts = [tags.get("speed_limit", ""), *(e.get("sign_type", "") for _, e in _list_elements(record, relations, "speed_limit"))]
-    for match in map(LIMIT.fullmatch, texts):
-        value = float(match[1]) if match is not None and match[1].count(".") < 2 and match[1] != "." else 0.0
-        if match is not None and value > 0:
-            return value * UNITS.get(match[2] or "km/h", 1 / 3.6)
-    return None
+def _find_limit(
+    record: Element, tags: Mapping[str, str], relations: Mapping[str, Element], ways: Mapping[str, _Way]
+) -> float | None:
+    """The speed limit of a lanelet, m/s: its own, or that of a rule or of the rule's sign; numbers without a unit are km/h."""
+    texts = [tags.get("speed_limit", "")]
+    for element, named in _list_elements(record, relations, "speed_limit"):
+        signs = [ways[member.get("ref")] for member in element.all("member") if member.get("ref") in ways]
+        texts += [named.get("sign_type", ""), *(sign.tags.get("subtype", "") for sign in signs)]
+    return next((speed for text in texts if (speed := lanelet_map.parse_speed(text, "km/h")) is not None), None)
 
 
 def _find_junctions(lanelets: Mapping[int, Lanelet]) -> set[int]:

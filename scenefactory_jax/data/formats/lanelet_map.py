@@ -1,5 +1,6 @@
 """Lanes and road edges of maps of lanelets, which have a left and a right border: CommonRoad and Lanelet2."""
 
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
@@ -10,6 +11,9 @@ from scenefactory_jax.core.types import EDGE_BOUNDARY
 from scenefactory_jax.data.formats import drivable_outline, polylines
 from scenefactory_jax.data.formats.argoverse2_map import centre
 from scenefactory_jax.data.formats.drivable_outline import OutlineNumbers, Points
+
+SPEED = re.compile(r"(?:de274-)?(\d+(?:\.\d*)?)\s*(mph|km/h|kmh|m/s|mps)?", re.IGNORECASE)  # such as 50, 30 mph; signs of Germany: de274-60
+UNITS = {"mph": 1609.344 / 3600, "km/h": 1 / 3.6, "kmh": 1 / 3.6, "m/s": 1.0, "mps": 1.0}
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,6 +71,14 @@ def make_roads(
     start = max(lanes, default=0) + 1
     others = [*marks.values(), *((EDGE_BOUNDARY, xyz) for xyz in edges), *features]
     return (*roads, *(Polyline(kind, xyz, start + place) for place, (kind, xyz) in enumerate(others)))
+
+
+def parse_speed(text: str, usual: str | None) -> float | None:
+    """A speed above 0 in m/s, in the unit `usual` where the text names none; None for other texts."""
+    match = SPEED.fullmatch(text.strip())
+    unit = usual if match is None or match[2] is None else match[2].lower()
+    value = 0.0 if match is None or unit is None else float(match[1]) * UNITS[unit]
+    return value if value > 0 else None
 
 
 def find_junction_lanes(lanelets: Mapping[int, Lanelet], start: int, inside: set[int]) -> list[int]:

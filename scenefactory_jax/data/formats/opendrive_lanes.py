@@ -91,6 +91,11 @@ class Road:
         """The section at a place."""
         return max(int(np.searchsorted(self.starts, s, side="right")) - 1, 0)
 
+    def is_short(self, index: int) -> bool:
+        """Whether a section has no length to speak of."""
+        end = self.starts[index + 1] if index + 1 < len(self.starts) else self.length
+        return end - self.starts[index] <= CLOSE_M
+
     def read_sections(self, spacing_m: float) -> Iterator[Section]:
         """Reads all sections, with points up to `spacing_m` apart."""
         for index in range(len(self.sections)):
@@ -99,7 +104,7 @@ class Road:
     def _read_section(self, index: int, spacing_m: float) -> Section:
         section, start = self.sections[index], self.starts[index]
         end = self.starts[index + 1] if index + 1 < len(self.starts) else self.length
-        if end - start <= INSIDE_M:
+        if self.is_short(index):
             return Section([], [], [], 0)
         records = sorted(
             (lane for side in ("left", "center", "right") for lane in section.walk(side, "lane")), key=lambda r: -r.integer("id")

@@ -1,5 +1,7 @@
 """Links between the lanes of an OpenDRIVE map, from those of sections, roads and junctions (ASAM OpenDRIVE 1.8, 10 to 12)."""
 
+import itertools
+from collections import defaultdict
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import replace
 from typing import NamedTuple
@@ -32,6 +34,7 @@ def find_links(roads: Mapping[str, Road], junctions: Mapping[str, Element], lane
     """
     joints = [joint for road in roads.values() for joint in _join_sections(road, roads)]
     joints += [joint for junction in junctions.values() for joint in _join_connections(junction, roads)]
+    joints += _bridge(joints, roads)
     links: dict[tuple[Key, Key], None] = {}
     opposed = set()
     for lane, end, other, other_end in joints:
@@ -55,6 +58,17 @@ def _join_sections(road: Road, roads: Mapping[str, Road]) -> Iterator[Joint]:
                 for link in record.walk("link", name) if place is not None else ():
                     assert place is not None
                     yield Joint(lane, end, (place[0], place[1], link.integer("id")), place[2])
+
+
+def _bridge(joints: Iterable[Joint], roads: Mapping[str, Road]) -> Iterator[Joint]:
+    """The joints of the lanes on both sides of sections that are too short for a lane."""
+    ends: dict[tuple[Key, int], dict[tuple[Key, int], None]] = defaultdict(dict)
+    for lane, end, other, other_end in joints:
+        ends[lane, end][other, other_end] = ends[other, other_end][lane, end] = None
+    for lane in [key for key, end in ends if end == START and key[0] in roads and roads[key[0]].is_short(key[1])]:
+        for before, after in itertools.product(list(ends[lane, START]), list(ends[lane, END])):
+            ends[before][after] = ends[after][before] = None
+            yield Joint(*before, *after)
 
 
 def _find_next_section(road: Road, index: int, last: int, side: str, roads: Mapping[str, Road]) -> tuple[str, int, int] | None:

@@ -53,15 +53,13 @@ def read_signals(roads: Mapping[str, Road], lanes: Mapping[Key, Lane], exits: Ma
 
 
 def _find_lanes(road: Road, entry: Element, s: float, lanes: Mapping[Key, Lane]) -> list[Lane]:
-    """The lanes beside a signal for which it is valid."""
+    """The lanes beside a signal for which it is valid: those that it names, against its orientation if need be, as RoadRunner writes it."""
     section, way = road.find_section(s), entry.get("orientation", "none")
     ranges = [sorted((limit.integer("fromLane"), limit.integer("toLane"))) for limit in entry.all("validity")]
     beside = [lane for key, lane in lanes.items() if key[:2] == (road.id, section)]
-    return [
-        lane
-        for lane in beside
-        if (way not in ("+", "-") or lane.forward == (way == "+")) and (not ranges or any(a <= lane.key[2] <= b for a, b in ranges))
-    ]
+    named = [lane for lane in beside if not ranges or any(a <= lane.key[2] <= b for a, b in ranges)]
+    fitting = [lane for lane in named if way not in ("+", "-") or lane.forward == (way == "+")]
+    return fitting or (named if ranges else [])
 
 
 def _follow(lane: Lane, s: float, lanes: Mapping[Key, Lane], exits: Mapping[Key, list[Key]], roads: Mapping[str, Road]) -> list[Key]:
