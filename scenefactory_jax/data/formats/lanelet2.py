@@ -2,11 +2,12 @@
 
 Links and neighbours follow from shared points and borders (Poggenhans et al., "Lanelet2: A high-definition map framework", 2018).
 Positions are projected by the transverse Mercator projection of UTM (Krüger's series, to 1 mm), relative to (0, 0) for maps around it, as
-INTERACTION's, and to the first point for others; `local_x` and `local_y` of a point go before.
+INTERACTION's, and to the first point for others; `local_x` and `local_y` of a point go before. Maps in
+left-handed axes are mirrored.
 """
 
 from collections import defaultdict
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -84,6 +85,8 @@ def read_map(path: Path, *, point_spacing_m: float, outline: OutlineNumbers, ele
     points, origin = _read_points(document)
     ways = {record.get("id"): _read_way(record, points) for record in document.all("way")}
     relations = {record.get("id"): record for record in document.all("relation")}
+    if _is_mirrored(relations.values(), ways):
+        ways = {number: way._replace(xyz=way.xyz * [1.0, -1.0, 1.0]) for number, way in ways.items()}
     shapes: dict[str, tuple[_Way, _Way]] = {}
     crossings = []
     for number, record in relations.items():
@@ -95,7 +98,8 @@ def read_map(path: Path, *, point_spacing_m: float, outline: OutlineNumbers, ele
             elif tags.get("subtype") not in UNPAVED:
                 shapes[number] = borders
     if not shapes:
-        raise SceneError(f"{path}: expected relations of the type lanelet for cars, got {len(relations)} others")
+        plain = "" if crossings else ", as plain OpenStreetMap has; SUMO's netconvert makes a network (.net.xml) of it"
+        raise SceneError(f"{path}: expected relations of the type lanelet for cars, got {len(relations)} others{plain}")
     ids = {number: place for place, number in enumerate(shapes)}
     lanelets = _make_lanelets(shapes, ids, relations, ways)
     inside = _find_junctions(lanelets)
@@ -142,6 +146,17 @@ def _read_way(record: Element, points: Mapping[str, np.ndarray]) -> _Way:
     if missing := [name for name in ids if name not in points]:
         raise SceneError(f"{record.where}: nd: expected the id of a node, got {missing[0][:20]!r}")
     return _Way(ids, np.array([points[name] for name in ids]).reshape(-1, 3), _read_tags(record))
+
+
+def _is_mirrored(relations: Iterable[Element], ways: Mapping[str, _Way]) -> bool:
+    """Whether most lanelets that have a centre line run against it: the axes are left-handed then, as CARLA's own."""
+    against = []
+    for record in relations:
+        names = [member.get("ref") for member in record.all("member") if member.get("role", "") == "centerline"]
+        if names and _read_tags(record).get("type") == "lanelet" and names[0] in ways and len(ways[names[0]].ids) > 1:
+            along, (left, _) = ways[names[0]].xyz, _read_borders(record, ways)
+            against.append(float((along[-1] - along[0]) @ (left.xyz[-1] - left.xyz[0])) < 0)
+    return 2 * sum(against) > len(against)
 
 
 def _read_borders(record: Element, ways: Mapping[str, _Way]) -> tuple[_Way, _Way]:

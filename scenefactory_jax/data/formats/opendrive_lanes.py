@@ -31,6 +31,7 @@ MARKS = {  # type -> WOMD's white and yellow road line; the nearest that forbids
     "botts dots": (6, 9),
 }  # fmt: skip
 UNITS = {"m/s": 1.0, "km/h": 1 / 3.6, "mph": 1609.344 / 3600}
+NO_JUNCTION = "-1"
 NO_LIMIT = ("no limit", "undefined", "")
 CLOSE_M = 1e-4  # places that are nearer to each other are one
 INSIDE_M = 1e-9  # before the end of a section, where its own pieces still count
@@ -78,7 +79,7 @@ class Road:
         self.starts = [section.number("s") for section in self.sections]
         self.types = sorted(record.all("type"), key=lambda entry: entry.number("s"))
         self.left_hand = record.get("rule", "RHT") == "LHT"
-        self.junction = record.get("junction", "-1")
+        self.junction = record.get("junction", NO_JUNCTION)
 
     def place(self, s: Column, t: Column) -> Line:
         """Points at places along and across the road."""

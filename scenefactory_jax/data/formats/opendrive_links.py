@@ -8,13 +8,14 @@ from typing import NamedTuple
 
 import numpy as np
 
-from scenefactory_jax.data.formats.opendrive_lanes import CLOSE_M, Key, Lane, Line, Road
+from scenefactory_jax.data.formats.opendrive_lanes import CLOSE_M, NO_JUNCTION, Key, Lane, Line, Road
 from scenefactory_jax.data.formats.xml_content import Element
 from scenefactory_jax.data.generators.curves import smoothstep
 
 START, END = 0, 1  # of a lane or a road, along s
 MAX_SHIFT_M = 5.0  # of the end of a lane to the lane that it belongs to
 SHIFT_M = 20.0  # along a lane, over which it is shifted
+MAX_INNER = 4  # lanes one after another in a junction
 SIDES = (("predecessor", START), ("successor", END))
 
 
@@ -116,6 +117,19 @@ def _find_junction_end(road: Road, junction: str, connecting: Road, end: int) ->
 
 def _end_point(road: Road, end: int) -> np.ndarray:
     return road.line(np.array([0.0 if end == START else road.length]))[0][0]
+
+
+def pass_limits(lanes: Mapping[Key, Lane], links: Iterable[tuple[Key, Key]], roads: Mapping[str, Road]) -> dict[Key, Lane]:
+    """The lanes; one in a junction without a limit has that of the lanes that lead into it, the lowest."""
+    passed, before = dict(lanes), defaultdict(list)
+    for lane, following in links:
+        if lanes[following].limit is None and roads[following[0]].junction != NO_JUNCTION:
+            before[following].append(lane)
+    for _ in range(MAX_INNER):
+        for key, leading in before.items():
+            known = [limit for lane in leading if (limit := passed[lane].limit) is not None]
+            passed[key] = replace(lanes[key], limit=min(known, default=None))
+    return passed
 
 
 def close_gaps(lanes: Mapping[Key, Lane], links: Iterable[tuple[Key, Key]]) -> dict[Key, Lane]:

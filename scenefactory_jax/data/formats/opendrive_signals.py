@@ -8,14 +8,13 @@ from typing import NamedTuple
 
 import numpy as np
 
-from scenefactory_jax.data.formats.opendrive_lanes import Key, Lane, Line, Road
+from scenefactory_jax.data.formats.opendrive_lanes import NO_JUNCTION, Key, Lane, Line, Road
 from scenefactory_jax.data.formats.xml_content import Element
 
 LIGHTS = ("1000001", "1000008", "1000009", "1000010", "1000011", "1000012")  # of ASAM's types, those for cars
 STOP_SIGNS = ("206", "R1-1")  # of Germany, and those that took its numbers; of the United States
 APPROACH_M = 40.0  # a signal farther before a junction stops cars on its own lane
 SAME_WAY_DEG = 45.0  # approaches of lights without controllers, along one axis, are green together
-NO_JUNCTION = "-1"
 
 
 class Signal(NamedTuple):
