@@ -3,6 +3,7 @@
 The file says where lights stand and which of them belong together (`controller`), not when they are red.
 """
 
+from collections import defaultdict
 from collections.abc import Iterator, Mapping
 from typing import NamedTuple
 
@@ -80,16 +81,24 @@ def _follow(lane: Lane, s: float, lanes: Mapping[Key, Lane], exits: Mapping[Key,
 
 
 def group_lights(signals: list[Signal], controllers: list[Element]) -> dict[str, list[list[Key]]]:
-    """The lanes with lights of each junction, in groups that are green together: by controllers, or else by the axis of the approach."""
+    """The lanes with lights of each junction, in groups that are green together: by controllers, or else by the axis of the approach.
+
+    A controller of lights for crossing directions is that of a whole junction, as netconvert writes it, and groups nothing.
+    """
     controlled = {control.get("signalId"): record.get("id") for record in controllers for control in record.all("control")}
+    headings: dict[tuple[str, str], list[float]] = defaultdict(list)
+    for signal in signals:
+        if signal.light and signal.id in controlled:
+            headings[signal.junction, controlled[signal.id]].append(signal.heading)
+    crossing = {key for key, found in headings.items() if not all(_is_same_axis(found[0], heading) for heading in found)}
     groups: dict[str, dict[str, list[Key]]] = {}
     axes: dict[str, list[float]] = {}
     taken: set[Key] = set()
     for signal in (signal for signal in signals if signal.light):
         name = controlled.get(signal.id)
-        if name is None:
+        if name is None or (signal.junction, name) in crossing:
             known = axes.setdefault(signal.junction, [])
-            near = (i for i, axis in enumerate(known) if abs(np.sin(axis - signal.heading)) < np.sin(np.deg2rad(SAME_WAY_DEG)))
+            near = (i for i, axis in enumerate(known) if _is_same_axis(axis, signal.heading))
             index = next(near, len(known))
             if index == len(known):
                 known.append(signal.heading)
@@ -99,6 +108,10 @@ def group_lights(signals: list[Signal], controllers: list[Element]) -> dict[str,
         if keys:
             groups.setdefault(signal.junction, {}).setdefault(name, []).extend(keys)
     return {junction: list(phases.values()) for junction, phases in groups.items()}
+
+
+def _is_same_axis(heading: float, other: float) -> bool:
+    return abs(float(np.sin(heading - other))) < float(np.sin(np.deg2rad(SAME_WAY_DEG)))
 
 
 def read_crosswalks(road: Road) -> Iterator[Line]:
