@@ -14,7 +14,7 @@ from scipy.spatial import KDTree
 
 from scenefactory_jax.core.raw_scene import LIGHT_STATES, Light, LightPlan, Polyline, RawScene, Reject, SceneError, Track
 from scenefactory_jax.core.types import CROSSWALK, LANE_BIKE, LANE_FREEWAY, LANE_STREET, STOP_SIGN, RoadUser
-from scenefactory_jax.data.formats import lanelet_map, scene_parts, xml_content
+from scenefactory_jax.data.formats import file_content, lanelet_map, scene_parts, xml_content
 from scenefactory_jax.data.formats.drivable_outline import OutlineNumbers, Points
 from scenefactory_jax.data.formats.lanelet_map import Lanelet
 from scenefactory_jax.data.formats.xml_content import Element
@@ -91,7 +91,7 @@ def read(
     tracks = _make_tracks(moves, lanes, steps, height_m, str(path))
     times = step_s * np.arange(steps)
     scene = RawScene(
-        name=document.get("benchmarkID", Path(path).stem),
+        name=document.get("benchmarkID", file_content.find_stem(path)),
         source=str(path),
         roads=roads,
         tracks=tuple(tracks),

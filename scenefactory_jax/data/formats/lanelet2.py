@@ -18,7 +18,7 @@ from scipy.spatial import KDTree
 
 from scenefactory_jax.core.raw_scene import Companion, Polyline, RawScene, Reject, SceneError
 from scenefactory_jax.core.types import CROSSWALK, EDGE_BOUNDARY, LANE_BIKE, LANE_FREEWAY, LANE_STREET, STOP_SIGN
-from scenefactory_jax.data.formats import lanelet_map, polylines, projection, xml_content
+from scenefactory_jax.data.formats import file_content, lanelet_map, polylines, projection, xml_content
 from scenefactory_jax.data.formats.drivable_outline import OutlineNumbers, Points
 from scenefactory_jax.data.formats.lanelet_map import Lanelet
 from scenefactory_jax.data.formats.opendrive_signals import Signal, group_lights
@@ -33,7 +33,7 @@ MARKS = {  # subtype of a line -> WOMD's white and yellow road line
 }  # fmt: skip
 PHYSICAL = ("curbstone", "road_border", "guard_rail", "wall", "fence", "jersey_barrier")  # lines that bound the road
 LINES = ("line_thin", "line_thick")
-STOP_SIGNS = ("usR1-1", "de206")
+STOP_SIGNS = ("usR1-1", "de206", "stop_sign")  # the last one of Autoware
 AROUND_ZERO_DEG = 0.5  # a map nearer to (0, 0) is in local metres
 OVERLAP_M2 = 1.0  # lanelets that share more area meet in a junction
 
@@ -67,7 +67,7 @@ def read(
     if (Path(path).parent.parent / "recorded_trackfiles" / Path(path).stem).is_dir():
         raise Companion(f"{path}: the map of recordings of INTERACTION")
     scene = RawScene(
-        name=Path(path).stem,
+        name=file_content.find_stem(path),
         source=str(path),
         roads=found.roads,
         tracks=(),
@@ -278,11 +278,16 @@ def _find_stop_signs(
     inside: set[int],
     start: int,
 ) -> Iterator[Polyline]:
-    """The stop signs of rights of way, with the lanes that have to stop; several elements may name one sign."""
+    """The stop signs of rights of way or, as in Autoware's maps, of lanelets, with the lanes that have to stop; rules may share a sign."""
     governed: dict[str, dict[int, None]] = defaultdict(dict)
-    for record in relations.values():
-        if _read_tags(record).get("subtype") == "right_of_way":
+    users: dict[str, list[str]] = defaultdict(list)
+    for number in ids:
+        for element, _ in _list_elements(relations[number], relations, "traffic_sign"):
+            users[element.get("id")].append(number)
+    for number, record in relations.items():
+        if number in users or _read_tags(record).get("subtype") in ("right_of_way", "all_way_stop"):
             members = [(member.get("role", ""), member.get("ref")) for member in record.all("member")]
+            members += [("yield", user) for user in users[number]]
             yielding = [ids[ref] for role, ref in members if role == "yield" and ref in ids]
             lanes = [lane for number in yielding for lane in lanelet_map.find_junction_lanes(lanelets, number, inside)]
             for post in (ref for role, ref in members if role == "refers" and ref in ways):

@@ -13,7 +13,7 @@ import numpy as np
 
 from scenefactory_jax.core.raw_scene import Polyline, RawScene, Reject, SceneError
 from scenefactory_jax.core.types import CROSSWALK, EDGE_BOUNDARY, STOP_SIGN
-from scenefactory_jax.data.formats import drivable_outline, opendrive_links, opendrive_signals, xml_content
+from scenefactory_jax.data.formats import drivable_outline, file_content, opendrive_links, opendrive_signals, xml_content
 from scenefactory_jax.data.formats.drivable_outline import OutlineNumbers
 from scenefactory_jax.data.formats.opendrive_lanes import DRIVEN, NO_JUNCTION, Key, Lane, Line, Road
 from scenefactory_jax.data.formats.xml_content import Element
@@ -75,7 +75,7 @@ def read(
     ]
     groups = opendrive_signals.group_lights(signals, document.all("controller"))
     scene = RawScene(
-        name=Path(path).stem,
+        name=file_content.find_stem(path),
         source=str(path),
         roads=(*_make_lanes(shapes.lanes, ids, links), *lines, *signs),
         tracks=(),

@@ -1,9 +1,9 @@
 """Networks of SUMO (`.net.xml`, schema net_file.xsd; Lopez et al., "Microscopic Traffic Simulation using SUMO", 2018).
 
-An edge has lanes side by side, numbered from the right, or from the left where traffic keeps left; lanes inside a junction belong to internal
-edges, through which connections lead. SUMO has no painted lines and no kerbs: lanes of one edge are divided by a dashed line where cars may
-change and by a solid one where they may not, as SUMO draws them, and what is paved (lanes for cars and bicycles, and junctions without
-pavements) is bounded by road edges.
+An edge has lanes side by side, numbered from the right, or from the left where traffic keeps left; lanes inside a junction belong to
+internal edges, through which connections lead. SUMO has no painted lines and no kerbs: lanes of one edge are divided by a dashed line where
+cars may change and by a solid one where they may not, as SUMO draws them, and what is paved (lanes for cars and bicycles, and junctions
+without pavements) is bounded by road edges.
 """
 
 import itertools
