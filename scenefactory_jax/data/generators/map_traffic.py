@@ -86,7 +86,7 @@ def draw_scenes(
             rng = np.random.default_rng(np.random.SeedSequence((zlib.crc32(raw.name.encode()), number, redraw)))
             lane = lanes[int(rng.choice(len(lanes), p=lengths / lengths.sum()))]
             middle = lane.xyz[int(rng.integers(len(lane.xyz))), :2]
-            part, near = _cut_map(raw, phases, middle, BEYOND * reach_m)
+            part, near = cut_map(raw, phases, middle, BEYOND * reach_m)
             network, stops = _build_network(part, near, middle, BEYOND * reach_m, lane_width_m, speed_limit_mps)
             every = add_warmup(times, warmup_s)
             gates = _follow_plans(draw_gates(rng, network, every), part, len(network.stops) - len(part.lights), every)
@@ -101,7 +101,7 @@ def draw_scenes(
         yield Reject(name, fault) if scene is None else scene
 
 
-def _cut_map(raw: RawScene, phases: Phases, middle: Float[np.ndarray, " 2"], half: float) -> tuple[RawScene, Phases]:
+def cut_map(raw: RawScene, phases: Phases, middle: Float[np.ndarray, " 2"], half: float) -> tuple[RawScene, Phases]:
     """The map in the square of half side `half` around `middle`: lanes, crosswalks and signs whole, of lines and edges the pieces there."""
     roads, cut = [], []
     for line in raw.roads:
