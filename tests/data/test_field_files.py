@@ -11,7 +11,7 @@ from support.scene_documents import FORMATS
 
 from scenefactory_jax.core.raw_scene import Companion, SceneError
 from scenefactory_jax.core.types import DRIVABLE, EDGES, STOP_SIGN
-from scenefactory_jax.data.formats import drivable_outline, lanelet_map, reader_selection
+from scenefactory_jax.data.formats import drivable_outline, lanelet2, lanelet_map, reader_selection
 from scenefactory_jax.data.formats.opendrive_signals import Signal, group_lights
 from scenefactory_jax.data.formats.xml_content import Element
 from scenefactory_jax.data.generators import map_traffic
@@ -151,6 +151,17 @@ def test_rules_of_autoware_and_signs_of_germany(read):
     limit = text.replace('<tag k="sign_type" v="50"/>', '<member type="way" ref="27" role="refers"/>').replace("usR1-1", "de274-60")
     lanes = [line for line in read("limit.osm", limit).roads if line.kind in DRIVABLE]
     assert lanes[1].speed_limit == pytest.approx(60 / 3.6)
+
+
+def test_lights_of_each_junction_have_their_own_cycle(tmp_path):
+    """Maps of towns: the lights of all junctions were one group."""
+    text = lanelet2_document()
+    far = re.sub(r'(k="local_x" v=")(\d+)', lambda m: f"{m[1]}{int(m[2]) + 300}", re.sub(r"""\b(id|ref)=(["'])""", r"\1=\g<2>9", text))
+    (tmp_path / "map.osm").write_text(text.replace("</osm>", far[far.index("<node") :]))
+    found = lanelet2.read_map(
+        tmp_path / "map.osm", point_spacing_m=1.0, outline=drivable_outline.OutlineNumbers(0.1), element_limit=1000, file_limit_mb=1
+    )
+    assert [len(groups) for groups in found.phases] == [1, 1] and len(found.inside) == 4
 
 
 def test_plain_openstreetmap_is_named(read):

@@ -7,6 +7,7 @@ import numpy as np
 import shapely
 from jaxtyping import Float
 from scipy.spatial import KDTree
+from shapely.geometry.base import BaseGeometry
 from shapely.geometry.polygon import orient
 
 from scenefactory_jax.core.raw_scene import SceneError
@@ -62,7 +63,7 @@ def find_edges(
     return [np.column_stack([piece, corners[tree.query(piece)[1], 2]]) for piece in pieces]
 
 
-def _unite(polygons: Sequence[shapely.Geometry]) -> shapely.Geometry:
+def _unite(polygons: Sequence[shapely.Geometry]) -> BaseGeometry:
     """The area of all polygons together."""
     try:
         return shapely.union_all(polygons)

@@ -14,6 +14,8 @@ from typing import Any, NamedTuple
 import numpy as np
 import shapely
 from jaxtyping import Float
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
 from scipy.spatial import KDTree
 
 from scenefactory_jax.core.raw_scene import Companion, Polyline, RawScene, Reject, SceneError
@@ -261,13 +263,15 @@ def _find_limit(
     return next((speed for text in texts if (speed := lanelet_map.parse_speed(text, "km/h")) is not None), None)
 
 
-def _find_junctions(lanelets: Mapping[int, Lanelet]) -> set[int]:
-    """The lanes that share area with others, as they do where they meet or part."""
+def _find_junctions(lanelets: Mapping[int, Lanelet]) -> dict[int, int]:
+    """The lanes that share area with others, as they do where they meet or part, with the numbers of their junctions."""
     numbers = list(lanelets)
     areas = shapely.make_valid([shapely.Polygon(np.concatenate([p.left, p.right[::-1]])[:, :2]) for p in lanelets.values()])
     first, second = shapely.STRtree(areas).query(areas, predicate="intersects")
     shared = shapely.area(shapely.intersection(areas[first], areas[second])) > OVERLAP_M2
-    return {numbers[row] for row in first[shared & (first != second)].tolist()}
+    first, second = first[shared & (first != second)], second[shared & (first != second)]
+    _, junction = connected_components(coo_array((np.ones(len(first)), (first, second)), shape=(len(numbers), len(numbers))))
+    return {numbers[row]: int(junction[row]) for row in first.tolist()}
 
 
 def _find_stop_signs(
@@ -275,7 +279,7 @@ def _find_stop_signs(
     ways: Mapping[str, _Way],
     ids: Mapping[str, int],
     lanelets: Mapping[int, Lanelet],
-    inside: set[int],
+    inside: Mapping[int, int],
     start: int,
 ) -> Iterator[Polyline]:
     """The stop signs of rights of way or, as in Autoware's maps, of lanelets, with the lanes that have to stop; rules may share a sign."""
@@ -298,14 +302,15 @@ def _find_stop_signs(
 
 
 def _find_phases(
-    relations: Mapping[str, Element], ids: Mapping[str, int], lanelets: Mapping[int, Lanelet], inside: set[int]
+    relations: Mapping[str, Element], ids: Mapping[str, int], lanelets: Mapping[int, Lanelet], inside: Mapping[int, int]
 ) -> list[list[list[int]]]:
-    """The lanes with lights, in groups that are green together: those of one axis."""
+    """The lanes with lights of each junction, in groups that are green together: those of one axis."""
     signals = []
     for number, place in ids.items():
         if _list_elements(relations[number], relations, "traffic_light"):
             lanelet = lanelets[place]
             along = lanelet.left[-1] - lanelet.left[-2]
             lanes = [("", 0, lane) for lane in lanelet_map.find_junction_lanes(lanelets, place, inside)]
-            signals.append(Signal(number, True, lanelet.left[-1:], tuple(lanes), "", float(np.arctan2(along[1], along[0]))))
+            junction = str(inside.get(lanes[0][2], "none"))
+            signals.append(Signal(number, True, lanelet.left[-1:], tuple(lanes), junction, float(np.arctan2(along[1], along[0]))))
     return [[[key[2] for key in group] for group in groups] for groups in group_lights(signals, []).values()]

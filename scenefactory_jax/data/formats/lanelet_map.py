@@ -1,7 +1,7 @@
 """Lanes and road edges of maps of lanelets, which have a left and a right border: CommonRoad and Lanelet2."""
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Container, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -81,7 +81,7 @@ def parse_speed(text: str, usual: str | None) -> float | None:
     return value if value > 0 else None
 
 
-def find_junction_lanes(lanelets: Mapping[int, Lanelet], start: int, inside: set[int]) -> list[int]:
+def find_junction_lanes(lanelets: Mapping[int, Lanelet], start: int, inside: Container[int]) -> list[int]:
     """The lanes that a light or sign at the end of lanelet `start` governs: those of the junction behind it, or itself if there is none."""
     if start in inside:
         return [start]
