@@ -126,7 +126,10 @@ def _read_points(document: Element) -> tuple[dict[str, Float[np.ndarray, "3"]], 
     nodes = document.all("node")
     if not nodes:
         raise SceneError(f"{document.where}: expected <node>, got none")
-    degrees = np.array([[node.number("lat"), node.number("lon")] for node in nodes])
+    tagged = [{tag.get("k"): tag for tag in node.all("tag")} for node in nodes]
+    local = ["local_x" in tags and "local_y" in tags for tags in tagged]
+    known = [not (placed and node.get("lat", "") == "") for node, placed in zip(nodes, local, strict=True)]  # Autoware leaves them empty
+    degrees = np.array([[n.number("lat"), n.number("lon")] if given else [0.0] * 2 for n, given in zip(nodes, known, strict=True)])
     if (bad := np.flatnonzero(np.abs(degrees).max(axis=1) > [180.0])).size or np.abs(degrees[:, 0]).max() >= 90:
         node = nodes[int(bad[0]) if bad.size else int(np.argmax(np.abs(degrees[:, 0])))]
         raise SceneError(f"{node.where}: expected degrees of latitude and longitude, got {node.get('lat')}, {node.get('lon')}")
@@ -135,9 +138,8 @@ def _read_points(document: Element) -> tuple[dict[str, Float[np.ndarray, "3"]], 
     origin = projection.project(middle[0], middle[1], meridian)
     plane = np.stack(projection.project(degrees[:, 0], degrees[:, 1], meridian), axis=1) - origin
     points = {}
-    for node, place in zip(nodes, plane, strict=True):
-        tags = {tag.get("k"): tag for tag in node.all("tag")}
-        if "local_x" in tags and "local_y" in tags:
+    for node, tags, placed, place in zip(nodes, tagged, local, plane, strict=True):
+        if placed:
             place = [tags[key].number("v") for key in ("local_x", "local_y")]
         points[node.get("id")] = np.array([*place, tags["ele"].number("v") if "ele" in tags else 0.0])
     return points, (float(origin[0]), float(origin[1]), 0.0)
