@@ -64,6 +64,14 @@ def test_a_section_without_length_is_passed_over(read):
     assert raw.name == "map" and raw.metadata["left_out"]["lanes_without_width"] == 0
 
 
+def test_empty_links_and_unusual_units_are_read(read):
+    """Links without an id, and kph, which scenariogeneration wrote for km/h."""
+    text = opendrive_document().replace('<link><successor elementType="junction"', '<link><predecessor/><successor elementType="junction"')
+    text = text.replace('<link><predecessor id="-1"/>', '<link><predecessor/><predecessor id="-1"/>')
+    plain, raw = read("plain.xodr", opendrive_document()), read("map.xodr", text.replace("km/h", "kph"))
+    assert [(line.exit, line.speed_limit) for line in raw.roads] == [(line.exit, line.speed_limit) for line in plain.roads]
+
+
 @pytest.mark.parametrize(("headings", "groups"), [((0.0, np.pi, np.pi / 2), [[0, 1], [2]]), ((0.0, np.pi), [[0, 1]])])
 def test_a_controller_of_crossing_lights_groups_nothing(headings, groups):
     """netconvert writes one controller for all lights of a junction."""

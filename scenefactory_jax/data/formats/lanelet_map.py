@@ -11,9 +11,9 @@ from scenefactory_jax.core.types import EDGE_BOUNDARY
 from scenefactory_jax.data.formats import drivable_outline, polylines
 from scenefactory_jax.data.formats.argoverse2_map import centre
 from scenefactory_jax.data.formats.drivable_outline import OutlineNumbers, Points
+from scenefactory_jax.data.formats.scene_parts import SPEED_UNITS
 
-SPEED = re.compile(r"(?:de274-)?(\d+(?:\.\d*)?)\s*(mph|km/h|kmh|m/s|mps)?", re.IGNORECASE)  # such as 50, 30 mph; signs of Germany: de274-60
-UNITS = {"mph": 1609.344 / 3600, "km/h": 1 / 3.6, "kmh": 1 / 3.6, "m/s": 1.0, "mps": 1.0}
+SPEED = re.compile(r"(?:de274-)?(\d+(?:\.\d*)?)\s*(mph|km/h|kmh|kph|m/s|mps)?", re.IGNORECASE)  # 50, 30 mph, and de274-60 of Germany
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,7 +77,7 @@ def parse_speed(text: str, usual: str | None) -> float | None:
     """A speed above 0 in m/s, in the unit `usual` where the text names none; None for other texts."""
     match = SPEED.fullmatch(text.strip())
     unit = usual if match is None or match[2] is None else match[2].lower()
-    value = 0.0 if match is None or unit is None else float(match[1]) * UNITS[unit]
+    value = 0.0 if match is None or unit is None else float(match[1]) * SPEED_UNITS[unit]
     return value if value > 0 else None
 
 

@@ -14,6 +14,7 @@ from jaxtyping import Float
 from scenefactory_jax.core.raw_scene import SceneError
 from scenefactory_jax.core.types import LANE_BIKE, LANE_FREEWAY, LANE_STREET
 from scenefactory_jax.data.formats.opendrive_curves import Column, Profile, ReferenceLine, read_profile, read_reference_line
+from scenefactory_jax.data.formats.scene_parts import SPEED_UNITS
 from scenefactory_jax.data.formats.xml_content import Element
 
 DRIVEN = (
@@ -30,7 +31,6 @@ MARKS = {  # type -> WOMD's white and yellow road line; the nearest that forbids
     "broken": (6, 9), "solid": (7, 11), "solid solid": (8, 12), "solid broken": (8, 13), "broken solid": (8, 13), "broken broken": (6, 10),
     "botts dots": (6, 9),
 }  # fmt: skip
-UNITS = {"m/s": 1.0, "km/h": 1 / 3.6, "mph": 1609.344 / 3600}
 NO_JUNCTION = "-1"
 NO_LIMIT = ("no limit", "undefined", "")
 CLOSE_M = 1e-4  # places that are nearer to each other are one
@@ -199,9 +199,9 @@ class Road:
         if limit is None or limit.get("max", "") in NO_LIMIT:
             return None
         unit = limit.get("unit", "m/s")
-        if unit not in UNITS:
-            raise SceneError(f"{limit.where}: unit: expected one of {', '.join(UNITS)}, got {unit[:20]!r}")
-        value = limit.number("max") * UNITS[unit]
+        if unit not in SPEED_UNITS:
+            raise SceneError(f"{limit.where}: unit: expected one of {', '.join(SPEED_UNITS)}, got {unit[:20]!r}")
+        value = limit.number("max") * SPEED_UNITS[unit]
         return value if value > 0 else None
 
     def _find_marks(self, lane: Element, s: Column, border: Column, start: float, end: float) -> Iterator[tuple[int, Line]]:

@@ -58,7 +58,8 @@ def _join_sections(road: Road, roads: Mapping[str, Road]) -> Iterator[Joint]:
                 place = _find_next_section(road, index + (1 if end == END else -1), last, name, roads)
                 for link in record.walk("link", name) if place is not None else ():
                     assert place is not None
-                    yield Joint(lane, end, (place[0], place[1], link.integer("id")), place[2])
+                    if "id" in link.attributes:  # some tools write empty links where there are none
+                        yield Joint(lane, end, (place[0], place[1], link.integer("id")), place[2])
 
 
 def _bridge(joints: Iterable[Joint], roads: Mapping[str, Road]) -> Iterator[Joint]:
@@ -77,7 +78,7 @@ def _find_next_section(road: Road, index: int, last: int, side: str, roads: Mapp
     if 0 <= index <= last:
         return road.id, index, START if side == "successor" else END
     link = next(road.record.walk("link", side), None)
-    if link is None or link.get("elementType", "road") != "road" or link.get("elementId") not in roads:
+    if link is None or link.get("elementType", "road") != "road" or link.get("elementId", "") not in roads:
         return None
     following = roads[link.get("elementId")]
     end = START if link.get("contactPoint", "start") == "start" else END
@@ -107,7 +108,7 @@ def _find_junction_end(road: Road, junction: str, connecting: Road, end: int) ->
         side
         for name, side in SIDES
         for link in road.record.walk("link", name)
-        if link.get("elementType", "") == "junction" and link.get("elementId") == junction
+        if link.get("elementType", "") == "junction" and link.get("elementId", "") == junction
     ]
     if len(linked) == 1:
         return linked[0]
