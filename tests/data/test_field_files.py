@@ -161,6 +161,14 @@ def test_rules_of_autoware_and_signs_of_germany(read):
     assert lanes[1].speed_limit == pytest.approx(60 / 3.6)
 
 
+def test_what_was_deleted_in_josm_is_left_out(read):
+    text = lanelet2_document()
+    for tag in ('<relation id="30"', '<way id="20"', '<node id="1"'):
+        text = text.replace(tag, f'{tag} action="delete"')
+    raw = read("map.osm", text)
+    assert sum(line.kind in DRIVABLE for line in raw.roads) == 3
+
+
 def test_lights_of_each_junction_have_their_own_cycle(tmp_path):
     """Maps of towns: the lights of all junctions were one group."""
     text = lanelet2_document()

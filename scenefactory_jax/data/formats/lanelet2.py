@@ -85,8 +85,8 @@ def read_map(path: Path, *, point_spacing_m: float, outline: OutlineNumbers, ele
     """Reads the roads of a map; see `read`."""
     document = xml_content.load(path, ROOT, file_limit_mb=file_limit_mb, element_limit=element_limit)
     points, origin = _read_points(document)
-    ways = {record.get("id"): _read_way(record, points) for record in document.all("way")}
-    relations = {record.get("id"): record for record in document.all("relation")}
+    ways = {record.get("id"): _read_way(record, points) for record in _list_records(document, "way")}
+    relations = {record.get("id"): record for record in _list_records(document, "relation")}
     if _is_mirrored(relations.values(), ways):
         ways = {number: way._replace(xyz=way.xyz * [1.0, -1.0, 1.0]) for number, way in ways.items()}
     shapes: dict[str, tuple[_Way, _Way]] = {}
@@ -117,13 +117,18 @@ def read_map(path: Path, *, point_spacing_m: float, outline: OutlineNumbers, ele
     return Map((*roads, *signs), _find_phases(relations, ids, lanelets, inside), sorted(inside), origin)
 
 
+def _list_records(document: Element, tag: str) -> list[Element]:
+    """The elements of a kind, without those that were deleted in JOSM, which keeps them in its files."""
+    return [record for record in document.all(tag) if record.get("action", "") != "delete"]
+
+
 def _read_tags(record: Element) -> dict[str, str]:
     return {tag.get("k"): tag.get("v") for tag in record.all("tag")}
 
 
 def _read_points(document: Element) -> tuple[dict[str, Float[np.ndarray, "3"]], tuple[float, float, float]]:
     """The points by their ids, and the origin of their coordinates."""
-    nodes = document.all("node")
+    nodes = _list_records(document, "node")
     if not nodes:
         raise SceneError(f"{document.where}: expected <node>, got none")
     tagged = [{tag.get("k"): tag for tag in node.all("tag")} for node in nodes]
