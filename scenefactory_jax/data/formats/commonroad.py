@@ -14,7 +14,7 @@ from scipy.spatial import KDTree
 
 from scenefactory_jax.core.raw_scene import LIGHT_STATES, Light, LightPlan, Polyline, RawScene, Reject, SceneError, Track
 from scenefactory_jax.core.types import CROSSWALK, LANE_BIKE, LANE_FREEWAY, LANE_STREET, STOP_SIGN, RoadUser
-from scenefactory_jax.data.formats import lanelet_map, scene_parts, xml_content
+from scenefactory_jax.data.formats import file_content, lanelet_map, scene_parts, xml_content
 from scenefactory_jax.data.formats.drivable_outline import OutlineNumbers, Points
 from scenefactory_jax.data.formats.lanelet_map import Lanelet
 from scenefactory_jax.data.formats.xml_content import Element
@@ -23,12 +23,13 @@ from scenefactory_jax.data.generators import map_traffic
 ROOT, VERSIONS = "commonRoad", ("2018b", "2020a")
 KINDS: dict[str, int | None] = {  # of lanelets that are no streets; None: paved, without a lane
     "highway": LANE_FREEWAY, "interstate": LANE_FREEWAY, "mainCarriageWay": LANE_FREEWAY, "accessRamp": LANE_FREEWAY,
-    "exitRamp": LANE_FREEWAY, "bicycleLane": LANE_BIKE, "shoulder": None, "parking": None,
+    "exitRamp": LANE_FREEWAY, "bicycleLane": LANE_BIKE, "shoulder": None, "parking": None, "restricted": None, "restricted_area": None,
 }  # fmt: skip
 UNPAVED = ("sidewalk", "crosswalk", "border")
 MARKS = {"solid": 7, "broad_solid": 7, "dashed": 6, "broad_dashed": 6}
 COLOURS = {"red": "stop", "redYellow": "stop", "yellow": "caution", "green": "go", "inactive": "unknown"}
-LIMIT_SIGNS, STOP_SIGNS = ("274", "274.1", "R2-1", "r301"), ("206", "R1-1", "r2")
+LIMIT_SIGNS = ("274", "274.1", "R2-1", "r301", "3.24", "R15", "C43", "B14", "Ρ-32", "B31")  # by country, as commonroad-io names them
+STOP_SIGNS = ("206", "R1-1", "r2")
 USERS: dict[str, RoadUser] = {"pedestrian": "pedestrian", "bicycle": "cyclist", "motorcycle": "cyclist"}
 VEHICLES = ("car", "truck", "bus", "taxi", "priorityVehicle", "parkedVehicle", "train")
 TURNS = {"successorsRight": "right", "successorsStraight": "straight", "successorsLeft": "left"}
@@ -90,7 +91,7 @@ def read(
     tracks = _make_tracks(moves, lanes, steps, height_m, str(path))
     times = step_s * np.arange(steps)
     scene = RawScene(
-        name=document.get("benchmarkID", Path(path).stem),
+        name=document.get("benchmarkID", file_content.find_stem(path)),
         source=str(path),
         roads=roads,
         tracks=tuple(tracks),
@@ -163,10 +164,15 @@ def _read_lanelet(record: Element, signs: Mapping[int, Element]) -> Lanelet:
 
 
 def _read_limit(sign: Element | None) -> Iterator[float]:
-    """The limits on a sign, m/s."""
+    """The limits on a sign, m/s; some scenarios give units, and signs without an id, of which values with a unit are limits."""
     for element in sign.all("trafficSignElement") if sign is not None else ():
-        if element.need("trafficSignID").text in LIMIT_SIGNS:
-            yield from (value.value() for value in element.all("additionalValue"))
+        kind = element.need("trafficSignID").text
+        for value in element.all("additionalValue") if kind in LIMIT_SIGNS or not kind else ():
+            limit = lanelet_map.parse_speed(value.text, "m/s" if kind else None)
+            if limit is not None:
+                yield limit
+            elif kind:
+                value.value()  # none, such as -1; refuses a text
 
 
 def _find_stop_signs(

@@ -7,6 +7,7 @@ import numpy as np
 import shapely
 from jaxtyping import Float
 from scipy.spatial import KDTree
+from shapely.geometry.base import BaseGeometry
 from shapely.geometry.polygon import orient
 
 from scenefactory_jax.core.raw_scene import SceneError
@@ -15,6 +16,7 @@ from scenefactory_jax.data.formats import polylines
 Points = Float[np.ndarray, "_ 3"]  # any number of them
 Area = Points | shapely.Polygon
 SIMPLIFY_M = 0.01  # maximum distance of a closed outline from what it was
+GRID_M = 1e-4  # of points, where areas that touch along slivers cannot be united without
 
 
 @dataclass(frozen=True)
@@ -43,7 +45,7 @@ def find_edges(
         return []
     try:
         polygons = [area if isinstance(area, shapely.Polygon) else shapely.Polygon(area[:, :2]) for area in areas]
-        area = shapely.union_all([shapely.make_valid(polygon) for polygon in polygons])
+        area = _unite([shapely.make_valid(polygon) for polygon in polygons])
         if (seam_m := numbers.seam_m) > 0:
             area = area.buffer(seam_m, join_style="mitre").buffer(-seam_m, join_style="mitre").simplify(SIMPLIFY_M)
         parts = [part for part in shapely.get_parts(area) if part.geom_type == "Polygon"]
@@ -59,6 +61,14 @@ def find_edges(
     corners = np.concatenate([np.pad(shapely.get_coordinates(a), ((0, 0), (0, 1))) if isinstance(a, shapely.Polygon) else a for a in areas])
     tree = KDTree(corners[:, :2])
     return [np.column_stack([piece, corners[tree.query(piece)[1], 2]]) for piece in pieces]
+
+
+def _unite(polygons: Sequence[shapely.Geometry]) -> BaseGeometry:
+    """The area of all polygons together."""
+    try:
+        return shapely.union_all(polygons)
+    except shapely.errors.GEOSException:
+        return shapely.union_all(polygons, grid_size=GRID_M)
 
 
 def _pieces(ring: Float[np.ndarray, "N 2"], cut: np.ndarray) -> list[Float[np.ndarray, "K 2"]]:

@@ -31,6 +31,12 @@ def unpacked_once() -> Iterator[None]:
         _cache.reset(token)
 
 
+def find_stem(path: Path) -> str:
+    """A file's name without the endings of its format and of compression."""
+    path = Path(path)
+    return (path.with_suffix("") if path.suffix in (".gz", ".xz") else path).stem
+
+
 def load_json(path: Path, *, file_limit_mb: int) -> dict[str, Any]:
     """Reads the JSON object in a file.
 

@@ -2,23 +2,25 @@
 
 Links and neighbours follow from shared points and borders (Poggenhans et al., "Lanelet2: A high-definition map framework", 2018).
 Positions are projected by the transverse Mercator projection of UTM (Krüger's series, to 1 mm), relative to (0, 0) for maps around it, as
-INTERACTION's, and to the first point for others; `local_x` and `local_y` of a point go before.
+INTERACTION's, and to the first point for others; `local_x` and `local_y` of a point go before. Maps in
+left-handed axes are mirrored.
 """
 
-import re
 from collections import defaultdict
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 import shapely
 from jaxtyping import Float
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
 from scipy.spatial import KDTree
 
 from scenefactory_jax.core.raw_scene import Companion, Polyline, RawScene, Reject, SceneError
 from scenefactory_jax.core.types import CROSSWALK, EDGE_BOUNDARY, LANE_BIKE, LANE_FREEWAY, LANE_STREET, STOP_SIGN
-from scenefactory_jax.data.formats import lanelet_map, polylines, projection, xml_content
+from scenefactory_jax.data.formats import file_content, lanelet_map, polylines, projection, xml_content
 from scenefactory_jax.data.formats.drivable_outline import OutlineNumbers, Points
 from scenefactory_jax.data.formats.lanelet_map import Lanelet
 from scenefactory_jax.data.formats.opendrive_signals import Signal, group_lights
@@ -33,9 +35,7 @@ MARKS = {  # subtype of a line -> WOMD's white and yellow road line
 }  # fmt: skip
 PHYSICAL = ("curbstone", "road_border", "guard_rail", "wall", "fence", "jersey_barrier")  # lines that bound the road
 LINES = ("line_thin", "line_thick")
-STOP_SIGNS = ("usR1-1", "de206")
-LIMIT = re.compile(r"([\d.]+)\s*(mph|km/h|kmh|m/s|mps)?")
-UNITS = {"mph": 1609.344 / 3600, "m/s": 1.0, "mps": 1.0}
+STOP_SIGNS = ("usR1-1", "de206", "stop_sign")  # the last one of Autoware
 AROUND_ZERO_DEG = 0.5  # a map nearer to (0, 0) is in local metres
 OVERLAP_M2 = 1.0  # lanelets that share more area meet in a junction
 
@@ -69,7 +69,7 @@ def read(
     if (Path(path).parent.parent / "recorded_trackfiles" / Path(path).stem).is_dir():
         raise Companion(f"{path}: the map of recordings of INTERACTION")
     scene = RawScene(
-        name=Path(path).stem,
+        name=file_content.find_stem(path),
         source=str(path),
         roads=found.roads,
         tracks=(),
@@ -85,8 +85,10 @@ def read_map(path: Path, *, point_spacing_m: float, outline: OutlineNumbers, ele
     """Reads the roads of a map; see `read`."""
     document = xml_content.load(path, ROOT, file_limit_mb=file_limit_mb, element_limit=element_limit)
     points, origin = _read_points(document)
-    ways = {record.get("id"): _read_way(record, points) for record in document.all("way")}
-    relations = {record.get("id"): record for record in document.all("relation")}
+    ways = {record.get("id"): _read_way(record, points) for record in _list_records(document, "way")}
+    relations = {record.get("id"): record for record in _list_records(document, "relation")}
+    if _is_mirrored(relations.values(), ways):
+        ways = {number: way._replace(xyz=way.xyz * [1.0, -1.0, 1.0]) for number, way in ways.items()}
     shapes: dict[str, tuple[_Way, _Way]] = {}
     crossings = []
     for number, record in relations.items():
@@ -98,9 +100,10 @@ def read_map(path: Path, *, point_spacing_m: float, outline: OutlineNumbers, ele
             elif tags.get("subtype") not in UNPAVED:
                 shapes[number] = borders
     if not shapes:
-        raise SceneError(f"{path}: expected relations of the type lanelet for cars, got {len(relations)} others")
+        plain = "" if crossings else ", as plain OpenStreetMap has; SUMO's netconvert makes a network (.net.xml) of it"
+        raise SceneError(f"{path}: expected relations of the type lanelet for cars, got {len(relations)} others{plain}")
     ids = {number: place for place, number in enumerate(shapes)}
-    lanelets = _make_lanelets(shapes, ids, relations)
+    lanelets = _make_lanelets(shapes, ids, relations, ways)
     inside = _find_junctions(lanelets)
     bounds = {frozenset(way.ids) for borders in shapes.values() for way in borders}
     lines = [way for way in ways.values() if len(way.ids) > 1]
@@ -114,16 +117,24 @@ def read_map(path: Path, *, point_spacing_m: float, outline: OutlineNumbers, ele
     return Map((*roads, *signs), _find_phases(relations, ids, lanelets, inside), sorted(inside), origin)
 
 
+def _list_records(document: Element, tag: str) -> list[Element]:
+    """The elements of a kind, without those that were deleted in JOSM, which keeps them in its files."""
+    return [record for record in document.all(tag) if record.get("action", "") != "delete"]
+
+
 def _read_tags(record: Element) -> dict[str, str]:
     return {tag.get("k"): tag.get("v") for tag in record.all("tag")}
 
 
 def _read_points(document: Element) -> tuple[dict[str, Float[np.ndarray, "3"]], tuple[float, float, float]]:
     """The points by their ids, and the origin of their coordinates."""
-    nodes = document.all("node")
+    nodes = _list_records(document, "node")
     if not nodes:
         raise SceneError(f"{document.where}: expected <node>, got none")
-    degrees = np.array([[node.number("lat"), node.number("lon")] for node in nodes])
+    tagged = [{tag.get("k"): tag for tag in node.all("tag")} for node in nodes]
+    local = ["local_x" in tags and "local_y" in tags for tags in tagged]
+    known = [not (placed and node.get("lat", "") == "") for node, placed in zip(nodes, local, strict=True)]  # Autoware leaves them empty
+    degrees = np.array([[n.number("lat"), n.number("lon")] if given else [0.0] * 2 for n, given in zip(nodes, known, strict=True)])
     if (bad := np.flatnonzero(np.abs(degrees).max(axis=1) > [180.0])).size or np.abs(degrees[:, 0]).max() >= 90:
         node = nodes[int(bad[0]) if bad.size else int(np.argmax(np.abs(degrees[:, 0])))]
         raise SceneError(f"{node.where}: expected degrees of latitude and longitude, got {node.get('lat')}, {node.get('lon')}")
@@ -132,9 +143,8 @@ def _read_points(document: Element) -> tuple[dict[str, Float[np.ndarray, "3"]], 
     origin = projection.project(middle[0], middle[1], meridian)
     plane = np.stack(projection.project(degrees[:, 0], degrees[:, 1], meridian), axis=1) - origin
     points = {}
-    for node, place in zip(nodes, plane, strict=True):
-        tags = {tag.get("k"): tag for tag in node.all("tag")}
-        if "local_x" in tags and "local_y" in tags:
+    for node, tags, placed, place in zip(nodes, tagged, local, plane, strict=True):
+        if placed:
             place = [tags[key].number("v") for key in ("local_x", "local_y")]
         points[node.get("id")] = np.array([*place, tags["ele"].number("v") if "ele" in tags else 0.0])
     return points, (float(origin[0]), float(origin[1]), 0.0)
@@ -145,6 +155,17 @@ def _read_way(record: Element, points: Mapping[str, np.ndarray]) -> _Way:
     if missing := [name for name in ids if name not in points]:
         raise SceneError(f"{record.where}: nd: expected the id of a node, got {missing[0][:20]!r}")
     return _Way(ids, np.array([points[name] for name in ids]).reshape(-1, 3), _read_tags(record))
+
+
+def _is_mirrored(relations: Iterable[Element], ways: Mapping[str, _Way]) -> bool:
+    """Whether most lanelets that have a centre line run against it: the axes are left-handed then, as CARLA's own."""
+    against = []
+    for record in relations:
+        names = [member.get("ref") for member in record.all("member") if member.get("role", "") == "centerline"]
+        if names and _read_tags(record).get("type") == "lanelet" and names[0] in ways and len(ways[names[0]].ids) > 1:
+            along, (left, _) = ways[names[0]].xyz, _read_borders(record, ways)
+            against.append(float((along[-1] - along[0]) @ (left.xyz[-1] - left.xyz[0])) < 0)
+    return 2 * sum(against) > len(against)
 
 
 def _read_borders(record: Element, ways: Mapping[str, _Way]) -> tuple[_Way, _Way]:
@@ -190,7 +211,9 @@ def _turn_to_road(lines: list[Points], lanelets: Mapping[int, Lanelet], spacing_
     return turned
 
 
-def _make_lanelets(shapes: Mapping[str, tuple[_Way, _Way]], ids: Mapping[str, int], relations: Mapping[str, Element]) -> dict[int, Lanelet]:
+def _make_lanelets(
+    shapes: Mapping[str, tuple[_Way, _Way]], ids: Mapping[str, int], relations: Mapping[str, Element], ways: Mapping[str, _Way]
+) -> dict[int, Lanelet]:
     """The lanelets with links by shared ends, and neighbours by shared borders that may be crossed."""
     begins, ends, lefts, rights = (defaultdict(list) for _ in range(4))
     for number, (left, right) in shapes.items():
@@ -210,7 +233,7 @@ def _make_lanelets(shapes: Mapping[str, tuple[_Way, _Way]], ids: Mapping[str, in
             exit=tuple(begins[left.ids[-1], right.ids[-1]]),
             beside_left=tuple(rights[left.ids]) if _is_crossed(left, "right") else (),
             beside_right=tuple(lefts[right.ids]) if _is_crossed(right, "left") else (),
-            limit=_find_limit(relations[number], tags, relations),
+            limit=_find_limit(relations[number], tags, relations, ways),
             marks=tuple(mark for way in (left, right) if (mark := _find_mark(way)) is not None),
         )
     return lanelets
@@ -236,23 +259,26 @@ def _list_elements(record: Element, relations: Mapping[str, Element], subtype: s
     return [(element, tags) for element in found if element is not None and (tags := _read_tags(element)).get("subtype") == subtype]
 
 
-def _find_limit(record: Element, tags: Mapping[str, str], relations: Mapping[str, Element]) -> float | None:
-    """The speed limit of a lanelet, m/s; numbers without a unit are km/h."""
-    texts = [tags.get("speed_limit", ""), *(e.get("sign_type", "") for _, e in _list_elements(record, relations, "speed_limit"))]
-    for match in map(LIMIT.fullmatch, texts):
-        value = float(match[1]) if match is not None and match[1].count(".") < 2 and match[1] != "." else 0.0
-        if match is not None and value > 0:
-            return value * UNITS.get(match[2] or "km/h", 1 / 3.6)
-    return None
+def _find_limit(
+    record: Element, tags: Mapping[str, str], relations: Mapping[str, Element], ways: Mapping[str, _Way]
+) -> float | None:
+    """The speed limit of a lanelet, m/s: its own, or that of a rule or of the rule's sign; numbers without a unit are km/h."""
+    texts = [tags.get("speed_limit", "")]
+    for element, named in _list_elements(record, relations, "speed_limit"):
+        signs = [ways[member.get("ref")] for member in element.all("member") if member.get("ref") in ways]
+        texts += [named.get("sign_type", ""), *(sign.tags.get("subtype", "") for sign in signs)]
+    return next((speed for text in texts if (speed := lanelet_map.parse_speed(text, "km/h")) is not None), None)
 
 
-def _find_junctions(lanelets: Mapping[int, Lanelet]) -> set[int]:
-    """The lanes that share area with others, as they do where they meet or part."""
+def _find_junctions(lanelets: Mapping[int, Lanelet]) -> dict[int, int]:
+    """The lanes that share area with others, as they do where they meet or part, with the numbers of their junctions."""
     numbers = list(lanelets)
     areas = shapely.make_valid([shapely.Polygon(np.concatenate([p.left, p.right[::-1]])[:, :2]) for p in lanelets.values()])
     first, second = shapely.STRtree(areas).query(areas, predicate="intersects")
     shared = shapely.area(shapely.intersection(areas[first], areas[second])) > OVERLAP_M2
-    return {numbers[row] for row in first[shared & (first != second)].tolist()}
+    first, second = first[shared & (first != second)], second[shared & (first != second)]
+    _, junction = connected_components(coo_array((np.ones(len(first)), (first, second)), shape=(len(numbers), len(numbers))))
+    return {numbers[row]: int(junction[row]) for row in first.tolist()}
 
 
 def _find_stop_signs(
@@ -260,14 +286,19 @@ def _find_stop_signs(
     ways: Mapping[str, _Way],
     ids: Mapping[str, int],
     lanelets: Mapping[int, Lanelet],
-    inside: set[int],
+    inside: Mapping[int, int],
     start: int,
 ) -> Iterator[Polyline]:
-    """The stop signs of rights of way, with the lanes that have to stop; several elements may name one sign."""
+    """The stop signs of rights of way or, as in Autoware's maps, of lanelets, with the lanes that have to stop; rules may share a sign."""
     governed: dict[str, dict[int, None]] = defaultdict(dict)
-    for record in relations.values():
-        if _read_tags(record).get("subtype") == "right_of_way":
+    users: dict[str, list[str]] = defaultdict(list)
+    for number in ids:
+        for element, _ in _list_elements(relations[number], relations, "traffic_sign"):
+            users[element.get("id")].append(number)
+    for number, record in relations.items():
+        if number in users or _read_tags(record).get("subtype") in ("right_of_way", "all_way_stop"):
             members = [(member.get("role", ""), member.get("ref")) for member in record.all("member")]
+            members += [("yield", user) for user in users[number]]
             yielding = [ids[ref] for role, ref in members if role == "yield" and ref in ids]
             lanes = [lane for number in yielding for lane in lanelet_map.find_junction_lanes(lanelets, number, inside)]
             for post in (ref for role, ref in members if role == "refers" and ref in ways):
@@ -278,14 +309,15 @@ def _find_stop_signs(
 
 
 def _find_phases(
-    relations: Mapping[str, Element], ids: Mapping[str, int], lanelets: Mapping[int, Lanelet], inside: set[int]
+    relations: Mapping[str, Element], ids: Mapping[str, int], lanelets: Mapping[int, Lanelet], inside: Mapping[int, int]
 ) -> list[list[list[int]]]:
-    """The lanes with lights, in groups that are green together: those of one axis."""
+    """The lanes with lights of each junction, in groups that are green together: those of one axis."""
     signals = []
     for number, place in ids.items():
         if _list_elements(relations[number], relations, "traffic_light"):
             lanelet = lanelets[place]
             along = lanelet.left[-1] - lanelet.left[-2]
             lanes = [("", 0, lane) for lane in lanelet_map.find_junction_lanes(lanelets, place, inside)]
-            signals.append(Signal(number, True, lanelet.left[-1:], tuple(lanes), "", float(np.arctan2(along[1], along[0]))))
+            junction = str(inside.get(lanes[0][2], "none"))
+            signals.append(Signal(number, True, lanelet.left[-1:], tuple(lanes), junction, float(np.arctan2(along[1], along[0]))))
     return [[[key[2] for key in group] for group in groups] for groups in group_lights(signals, []).values()]

@@ -1,6 +1,7 @@
 """Lanes and road edges of maps of lanelets, which have a left and a right border: CommonRoad and Lanelet2."""
 
-from collections.abc import Mapping, Sequence
+import re
+from collections.abc import Container, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -10,6 +11,9 @@ from scenefactory_jax.core.types import EDGE_BOUNDARY
 from scenefactory_jax.data.formats import drivable_outline, polylines
 from scenefactory_jax.data.formats.argoverse2_map import centre
 from scenefactory_jax.data.formats.drivable_outline import OutlineNumbers, Points
+from scenefactory_jax.data.formats.scene_parts import SPEED_UNITS
+
+SPEED = re.compile(r"(?:de274-)?(\d+(?:\.\d*)?)\s*(mph|km/h|kmh|kph|m/s|mps)?", re.IGNORECASE)  # 50, 30 mph, and de274-60 of Germany
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,7 +73,15 @@ def make_roads(
     return (*roads, *(Polyline(kind, xyz, start + place) for place, (kind, xyz) in enumerate(others)))
 
 
-def find_junction_lanes(lanelets: Mapping[int, Lanelet], start: int, inside: set[int]) -> list[int]:
+def parse_speed(text: str, usual: str | None) -> float | None:
+    """A speed above 0 in m/s, in the unit `usual` where the text names none; None for other texts."""
+    match = SPEED.fullmatch(text.strip())
+    unit = usual if match is None or match[2] is None else match[2].lower()
+    value = 0.0 if match is None or unit is None else float(match[1]) * SPEED_UNITS[unit]
+    return value if value > 0 else None
+
+
+def find_junction_lanes(lanelets: Mapping[int, Lanelet], start: int, inside: Container[int]) -> list[int]:
     """The lanes that a light or sign at the end of lanelet `start` governs: those of the junction behind it, or itself if there is none."""
     if start in inside:
         return [start]

@@ -13,9 +13,9 @@ import numpy as np
 
 from scenefactory_jax.core.raw_scene import Polyline, RawScene, Reject, SceneError
 from scenefactory_jax.core.types import CROSSWALK, EDGE_BOUNDARY, STOP_SIGN
-from scenefactory_jax.data.formats import drivable_outline, opendrive_links, opendrive_signals, xml_content
+from scenefactory_jax.data.formats import drivable_outline, file_content, opendrive_links, opendrive_signals, xml_content
 from scenefactory_jax.data.formats.drivable_outline import OutlineNumbers
-from scenefactory_jax.data.formats.opendrive_lanes import DRIVEN, Key, Lane, Line, Road
+from scenefactory_jax.data.formats.opendrive_lanes import DRIVEN, NO_JUNCTION, Key, Lane, Line, Road
 from scenefactory_jax.data.formats.xml_content import Element
 from scenefactory_jax.data.generators import map_traffic
 
@@ -57,7 +57,7 @@ def read(
         raise SceneError(f"{path}: expected lanes of the types {', '.join(DRIVEN)}, got none")
     junctions = {record.get("id"): record for record in document.all("junction")}
     links, opposed = opendrive_links.find_links(roads, junctions, shapes.lanes)
-    shapes = shapes._replace(lanes=opendrive_links.close_gaps(shapes.lanes, links))
+    shapes = shapes._replace(lanes=opendrive_links.close_gaps(opendrive_links.pass_limits(shapes.lanes, links, roads), links))
     exits: dict[Key, list[Key]] = defaultdict(list)
     for lane, following in links:
         exits[lane].append(following)
@@ -75,7 +75,7 @@ def read(
     ]
     groups = opendrive_signals.group_lights(signals, document.all("controller"))
     scene = RawScene(
-        name=Path(path).stem,
+        name=file_content.find_stem(path),
         source=str(path),
         roads=(*_make_lanes(shapes.lanes, ids, links), *lines, *signs),
         tracks=(),
@@ -85,7 +85,7 @@ def read(
         metadata={
             "dataset": "opendrive",
             "format": "opendrive",
-            "intersection_lanes": [ids[key] for key in ids if roads[key[0]].junction != opendrive_signals.NO_JUNCTION],
+            "intersection_lanes": [ids[key] for key in ids if roads[key[0]].junction != NO_JUNCTION],
             "left_out": {"lanes_without_width": shapes.lost, "links_of_opposed_lanes": opposed},
             "tokens": {"features": {".".join(map(str, key)): number for key, number in ids.items()}},
         },

@@ -16,6 +16,7 @@ from scenefactory_jax.data.formats.xml_content import Element
 Column = Float[np.ndarray, " N"]
 Frames = tuple[Float[np.ndarray, "N 2"], Float[np.ndarray, " N"]]  # points, and the headings there
 COEFFICIENTS = ("a", "b", "c", "d")
+MAX_COEFFICIENT = 1e30  # RoadRunner writes pieces of 1e-6 m, whose cubic coefficients reach 1e19
 NODES, WEIGHTS = np.polynomial.legendre.leggauss(5)  # of a piece in which the heading turns little
 STEP_M = 1.0  # of integration, and of the table of arc lengths
 MAX_STEPS = 100_000  # of one geometry
@@ -39,7 +40,7 @@ class Profile:
 
 def read_profile(records: Sequence[Element], key: str = "s", offset: float = 0.0) -> Profile:
     """Reads the pieces of a profile, whose starts `key` gives from `offset` on; of equal starts the last one counts."""
-    rows = {record.number(key) + offset: [record.number(name, 0.0) for name in COEFFICIENTS] for record in records}
+    rows = {record.number(key) + offset: [record.number(c, 0.0, limit=MAX_COEFFICIENT) for c in COEFFICIENTS] for record in records}
     starts = sorted(rows)
     return Profile(np.array(starts, float), np.array([rows[start] for start in starts], float).reshape(-1, 4))
 

@@ -14,6 +14,7 @@ from jaxtyping import Float
 from scenefactory_jax.core.raw_scene import SceneError
 from scenefactory_jax.core.types import LANE_BIKE, LANE_FREEWAY, LANE_STREET
 from scenefactory_jax.data.formats.opendrive_curves import Column, Profile, ReferenceLine, read_profile, read_reference_line
+from scenefactory_jax.data.formats.scene_parts import SPEED_UNITS
 from scenefactory_jax.data.formats.xml_content import Element
 
 DRIVEN = (
@@ -30,7 +31,7 @@ MARKS = {  # type -> WOMD's white and yellow road line; the nearest that forbids
     "broken": (6, 9), "solid": (7, 11), "solid solid": (8, 12), "solid broken": (8, 13), "broken solid": (8, 13), "broken broken": (6, 10),
     "botts dots": (6, 9),
 }  # fmt: skip
-UNITS = {"m/s": 1.0, "km/h": 1 / 3.6, "mph": 1609.344 / 3600}
+NO_JUNCTION = "-1"
 NO_LIMIT = ("no limit", "undefined", "")
 CLOSE_M = 1e-4  # places that are nearer to each other are one
 INSIDE_M = 1e-9  # before the end of a section, where its own pieces still count
@@ -78,7 +79,7 @@ class Road:
         self.starts = [section.number("s") for section in self.sections]
         self.types = sorted(record.all("type"), key=lambda entry: entry.number("s"))
         self.left_hand = record.get("rule", "RHT") == "LHT"
-        self.junction = record.get("junction", "-1")
+        self.junction = record.get("junction", NO_JUNCTION)
 
     def place(self, s: Column, t: Column) -> Line:
         """Points at places along and across the road."""
@@ -91,6 +92,11 @@ class Road:
         """The section at a place."""
         return max(int(np.searchsorted(self.starts, s, side="right")) - 1, 0)
 
+    def is_short(self, index: int) -> bool:
+        """Whether a section has no length to speak of."""
+        end = self.starts[index + 1] if index + 1 < len(self.starts) else self.length
+        return end - self.starts[index] <= CLOSE_M
+
     def read_sections(self, spacing_m: float) -> Iterator[Section]:
         """Reads all sections, with points up to `spacing_m` apart."""
         for index in range(len(self.sections)):
@@ -99,7 +105,7 @@ class Road:
     def _read_section(self, index: int, spacing_m: float) -> Section:
         section, start = self.sections[index], self.starts[index]
         end = self.starts[index + 1] if index + 1 < len(self.starts) else self.length
-        if end - start <= INSIDE_M:
+        if self.is_short(index):
             return Section([], [], [], 0)
         records = sorted(
             (lane for side in ("left", "center", "right") for lane in section.walk(side, "lane")), key=lambda r: -r.integer("id")
@@ -193,9 +199,9 @@ class Road:
         if limit is None or limit.get("max", "") in NO_LIMIT:
             return None
         unit = limit.get("unit", "m/s")
-        if unit not in UNITS:
-            raise SceneError(f"{limit.where}: unit: expected one of {', '.join(UNITS)}, got {unit[:20]!r}")
-        value = limit.number("max") * UNITS[unit]
+        if unit not in SPEED_UNITS:
+            raise SceneError(f"{limit.where}: unit: expected one of {', '.join(SPEED_UNITS)}, got {unit[:20]!r}")
+        value = limit.number("max") * SPEED_UNITS[unit]
         return value if value > 0 else None
 
     def _find_marks(self, lane: Element, s: Column, border: Column, start: float, end: float) -> Iterator[tuple[int, Line]]:

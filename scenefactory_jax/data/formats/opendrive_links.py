@@ -1,18 +1,21 @@
 """Links between the lanes of an OpenDRIVE map, from those of sections, roads and junctions (ASAM OpenDRIVE 1.8, 10 to 12)."""
 
+import itertools
+from collections import defaultdict
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
 
-from scenefactory_jax.data.formats.opendrive_lanes import CLOSE_M, Key, Lane, Line, Road
+from scenefactory_jax.data.formats.opendrive_lanes import CLOSE_M, NO_JUNCTION, Key, Lane, Line, Road
 from scenefactory_jax.data.formats.xml_content import Element
 from scenefactory_jax.data.generators.curves import smoothstep
 
 START, END = 0, 1  # of a lane or a road, along s
 MAX_SHIFT_M = 5.0  # of the end of a lane to the lane that it belongs to
 SHIFT_M = 20.0  # along a lane, over which it is shifted
+MAX_INNER = 4  # lanes one after another in a junction
 SIDES = (("predecessor", START), ("successor", END))
 
 
@@ -32,6 +35,7 @@ def find_links(roads: Mapping[str, Road], junctions: Mapping[str, Element], lane
     """
     joints = [joint for road in roads.values() for joint in _join_sections(road, roads)]
     joints += [joint for junction in junctions.values() for joint in _join_connections(junction, roads)]
+    joints += _bridge(joints, roads)
     links: dict[tuple[Key, Key], None] = {}
     opposed = set()
     for lane, end, other, other_end in joints:
@@ -54,7 +58,19 @@ def _join_sections(road: Road, roads: Mapping[str, Road]) -> Iterator[Joint]:
                 place = _find_next_section(road, index + (1 if end == END else -1), last, name, roads)
                 for link in record.walk("link", name) if place is not None else ():
                     assert place is not None
-                    yield Joint(lane, end, (place[0], place[1], link.integer("id")), place[2])
+                    if "id" in link.attributes:  # some tools write empty links where there are none
+                        yield Joint(lane, end, (place[0], place[1], link.integer("id")), place[2])
+
+
+def _bridge(joints: Iterable[Joint], roads: Mapping[str, Road]) -> Iterator[Joint]:
+    """The joints of the lanes on both sides of sections that are too short for a lane."""
+    ends: dict[tuple[Key, int], dict[tuple[Key, int], None]] = defaultdict(dict)
+    for lane, end, other, other_end in joints:
+        ends[lane, end][other, other_end] = ends[other, other_end][lane, end] = None
+    for lane in [key for key, end in ends if end == START and key[0] in roads and roads[key[0]].is_short(key[1])]:
+        for before, after in itertools.product(list(ends[lane, START]), list(ends[lane, END])):
+            ends[before][after] = ends[after][before] = None
+            yield Joint(*before, *after)
 
 
 def _find_next_section(road: Road, index: int, last: int, side: str, roads: Mapping[str, Road]) -> tuple[str, int, int] | None:
@@ -62,7 +78,7 @@ def _find_next_section(road: Road, index: int, last: int, side: str, roads: Mapp
     if 0 <= index <= last:
         return road.id, index, START if side == "successor" else END
     link = next(road.record.walk("link", side), None)
-    if link is None or link.get("elementType", "road") != "road" or link.get("elementId") not in roads:
+    if link is None or link.get("elementType", "road") != "road" or link.get("elementId", "") not in roads:
         return None
     following = roads[link.get("elementId")]
     end = START if link.get("contactPoint", "start") == "start" else END
@@ -92,7 +108,7 @@ def _find_junction_end(road: Road, junction: str, connecting: Road, end: int) ->
         side
         for name, side in SIDES
         for link in road.record.walk("link", name)
-        if link.get("elementType", "") == "junction" and link.get("elementId") == junction
+        if link.get("elementType", "") == "junction" and link.get("elementId", "") == junction
     ]
     if len(linked) == 1:
         return linked[0]
@@ -102,6 +118,19 @@ def _find_junction_end(road: Road, junction: str, connecting: Road, end: int) ->
 
 def _end_point(road: Road, end: int) -> np.ndarray:
     return road.line(np.array([0.0 if end == START else road.length]))[0][0]
+
+
+def pass_limits(lanes: Mapping[Key, Lane], links: Iterable[tuple[Key, Key]], roads: Mapping[str, Road]) -> dict[Key, Lane]:
+    """The lanes; one in a junction without a limit has that of the lanes that lead into it, the lowest."""
+    passed, before = dict(lanes), defaultdict(list)
+    for lane, following in links:
+        if lanes[following].limit is None and roads[following[0]].junction != NO_JUNCTION:
+            before[following].append(lane)
+    for _ in range(MAX_INNER):
+        for key, leading in before.items():
+            known = [limit for lane in leading if (limit := passed[lane].limit) is not None]
+            passed[key] = replace(lanes[key], limit=min(known, default=None))
+    return passed
 
 
 def close_gaps(lanes: Mapping[Key, Lane], links: Iterable[tuple[Key, Key]]) -> dict[Key, Lane]:

@@ -3,19 +3,19 @@
 The file says where lights stand and which of them belong together (`controller`), not when they are red.
 """
 
+from collections import defaultdict
 from collections.abc import Iterator, Mapping
 from typing import NamedTuple
 
 import numpy as np
 
-from scenefactory_jax.data.formats.opendrive_lanes import Key, Lane, Line, Road
+from scenefactory_jax.data.formats.opendrive_lanes import NO_JUNCTION, Key, Lane, Line, Road
 from scenefactory_jax.data.formats.xml_content import Element
 
 LIGHTS = ("1000001", "1000008", "1000009", "1000010", "1000011", "1000012")  # of ASAM's types, those for cars
 STOP_SIGNS = ("206", "R1-1")  # of Germany, and those that took its numbers; of the United States
 APPROACH_M = 40.0  # a signal farther before a junction stops cars on its own lane
 SAME_WAY_DEG = 45.0  # approaches of lights without controllers, along one axis, are green together
-NO_JUNCTION = "-1"
 
 
 class Signal(NamedTuple):
@@ -53,15 +53,13 @@ def read_signals(roads: Mapping[str, Road], lanes: Mapping[Key, Lane], exits: Ma
 
 
 def _find_lanes(road: Road, entry: Element, s: float, lanes: Mapping[Key, Lane]) -> list[Lane]:
-    """The lanes beside a signal for which it is valid."""
+    """The lanes beside a signal for which it is valid: those that it names, against its orientation if need be, as RoadRunner writes it."""
     section, way = road.find_section(s), entry.get("orientation", "none")
     ranges = [sorted((limit.integer("fromLane"), limit.integer("toLane"))) for limit in entry.all("validity")]
     beside = [lane for key, lane in lanes.items() if key[:2] == (road.id, section)]
-    return [
-        lane
-        for lane in beside
-        if (way not in ("+", "-") or lane.forward == (way == "+")) and (not ranges or any(a <= lane.key[2] <= b for a, b in ranges))
-    ]
+    named = [lane for lane in beside if not ranges or any(a <= lane.key[2] <= b for a, b in ranges)]
+    fitting = [lane for lane in named if way not in ("+", "-") or lane.forward == (way == "+")]
+    return fitting or (named if ranges else [])
 
 
 def _follow(lane: Lane, s: float, lanes: Mapping[Key, Lane], exits: Mapping[Key, list[Key]], roads: Mapping[str, Road]) -> list[Key]:
@@ -83,16 +81,24 @@ def _follow(lane: Lane, s: float, lanes: Mapping[Key, Lane], exits: Mapping[Key,
 
 
 def group_lights(signals: list[Signal], controllers: list[Element]) -> dict[str, list[list[Key]]]:
-    """The lanes with lights of each junction, in groups that are green together: by controllers, or else by the axis of the approach."""
+    """The lanes with lights of each junction, in groups that are green together: by controllers, or else by the axis of the approach.
+
+    A controller of lights for crossing directions is that of a whole junction, as netconvert writes it, and groups nothing.
+    """
     controlled = {control.get("signalId"): record.get("id") for record in controllers for control in record.all("control")}
+    headings: dict[tuple[str, str], list[float]] = defaultdict(list)
+    for signal in signals:
+        if signal.light and signal.id in controlled:
+            headings[signal.junction, controlled[signal.id]].append(signal.heading)
+    crossing = {key for key, found in headings.items() if not all(_is_same_axis(found[0], heading) for heading in found)}
     groups: dict[str, dict[str, list[Key]]] = {}
     axes: dict[str, list[float]] = {}
     taken: set[Key] = set()
     for signal in (signal for signal in signals if signal.light):
         name = controlled.get(signal.id)
-        if name is None:
+        if name is None or (signal.junction, name) in crossing:
             known = axes.setdefault(signal.junction, [])
-            near = (i for i, axis in enumerate(known) if abs(np.sin(axis - signal.heading)) < np.sin(np.deg2rad(SAME_WAY_DEG)))
+            near = (i for i, axis in enumerate(known) if _is_same_axis(axis, signal.heading))
             index = next(near, len(known))
             if index == len(known):
                 known.append(signal.heading)
@@ -102,6 +108,10 @@ def group_lights(signals: list[Signal], controllers: list[Element]) -> dict[str,
         if keys:
             groups.setdefault(signal.junction, {}).setdefault(name, []).extend(keys)
     return {junction: list(phases.values()) for junction, phases in groups.items()}
+
+
+def _is_same_axis(heading: float, other: float) -> bool:
+    return abs(float(np.sin(heading - other))) < float(np.sin(np.deg2rad(SAME_WAY_DEG)))
 
 
 def read_crosswalks(road: Road) -> Iterator[Line]:

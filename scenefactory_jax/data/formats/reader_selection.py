@@ -34,12 +34,15 @@ ROOTS = {
     "osm": "OpenStreetMap XML, such as the Lanelet2 maps of INTERACTION",
     "net": "a network of SUMO",
     "fcd-export": "a recording of SUMO",
+    "nodes": "an input of SUMO's netconvert",
+    "edges": "an input of SUMO's netconvert",
+    "connections": "an input of SUMO's netconvert",
     "routes": "a route file of SUMO",
     "additional": "a file of additional elements of SUMO",
     "configuration": "a configuration, such as SUMO's",
     "sumoConfiguration": "a configuration of SUMO",
 }
-GIVE = {root: "give the network (.net.xml), or a recording (--fcd-output) beside it" for root in list(ROOTS)[-4:]}
+GIVE = {root: "give the network (.net.xml), or a recording (--fcd-output) beside it" for root in list(ROOTS)[-7:]}
 BEFORE_ROOT = re.compile(r"<\?.*?\?>|<!--.*?-->|<!DOCTYPE[^>]*>", re.DOTALL)  # declaration, comments and document type
 Reader = Callable[[Path], Iterator[RawScene | Reject]]
 

@@ -16,6 +16,7 @@ from scenefactory_jax.data.formats.values import AXES, check_finite
 INTEGER = re.compile(r"0|-?[1-9]\d{0,17}")  # a text that converts to an integer of 64 bits and back
 WOMD_TYPES: tuple[RoadUser, ...] = ("other", *ROAD_USERS)  # Track.ObjectType: unset, vehicle, pedestrian, cyclist, other
 STATE = ("x", "y", "z", "yaw", "velocity_x", "velocity_y", "length", "width", "height")  # columns of a table of states
+SPEED_UNITS = {"m/s": 1.0, "km/h": 1 / 3.6, "mph": 1609.344 / 3600, "mps": 1.0, "kmh": 1 / 3.6, "kph": 1 / 3.6}  # in m/s
 KINDS: dict[str, RoadUser] = {kind: kind for kind in ROAD_USERS}
 
 

@@ -28,7 +28,10 @@ TYPES = ("routes", "additional")  # roots of files with types of vehicles
 BESIDE = re.compile(r"\.(xml|csv)(\.gz)?$")  # names of files that SUMO reads or writes
 CONFIGURED = re.compile(r'<(net-file|route-files|additional-files) value="([^"]*)"')  # in the comment at the head of what SUMO writes
 STEP_LENGTH = re.compile(r'<step-length value="([\d.]+)"')
-OTHER_FILES = re.compile(r"<(?:\w+:)?(routes|additional|configuration|sumoConfiguration|trips|tlsStates)[\s/>]")
+OTHER_FILES = re.compile(
+    r"<(?:\w+:)?(routes|additional|add|configuration|sumoConfiguration|trips|flows|tazs|tlsStates|tlLogic|viewsettings|nodes|edges|"
+    r"connections|types)[\s/>]"
+)
 COLUMNS = ("id", "x", "y", "angle", "speed")  # of a recording that are needed
 DEFAULT_PERSON = "DEFAULT_PEDTYPE"
 DEFAULTS = {DEFAULT_PERSON: "pedestrian", "DEFAULT_BIKETYPE": "bicycle", "DEFAULT_TAXITYPE": "taxi", "DEFAULT_RAILTYPE": "rail"}

@@ -1,8 +1,9 @@
 """Networks of SUMO (`.net.xml`, schema net_file.xsd; Lopez et al., "Microscopic Traffic Simulation using SUMO", 2018).
 
-An edge has lanes side by side, numbered from the right; lanes inside a junction belong to internal edges, through which connections lead.
-SUMO has no painted lines and no kerbs: lanes of one edge are divided by a dashed line where cars may change and by a solid one where they
-may not, as SUMO draws them, and what is paved (lanes for cars and bicycles, and junctions without pavements) is bounded by road edges.
+An edge has lanes side by side, numbered from the right, or from the left where traffic keeps left; lanes inside a junction belong to
+internal edges, through which connections lead. SUMO has no painted lines and no kerbs: lanes of one edge are divided by a dashed line where
+cars may change and by a solid one where they may not, as SUMO draws them, and what is paved (lanes for cars and bicycles, and junctions
+without pavements) is bounded by road edges.
 """
 
 import itertools
@@ -36,7 +37,7 @@ FIXED = ("static", "")  # programs whose cycle does not depend on the traffic
 STOPS = ("s", "w")  # states of connections: a stop sign, and one at every arm
 DASHED, SOLID = 6, 7
 MAX_INNER = 4  # lanes one after another inside a junction; SUMO's left turns have two
-FACING_M = 0.3  # between the leftmost borders of two directions of a street
+FACING_M = 0.3  # between the inner borders of two directions of a street
 
 
 class Signal(NamedTuple):
@@ -72,6 +73,7 @@ class _Lane:
     edge: Element
     allowed: frozenset[str]
     inner: bool  # inside a junction
+    middle: int  # the middle of the street is on its left: 1; on its right, where traffic keeps left: -1
     entry: list[int] = field(default_factory=list)
     exit: list[int] = field(default_factory=list)
 
@@ -87,6 +89,7 @@ def read_net(path: Path, *, point_spacing_m: float, outline: OutlineNumbers, ele
     edges = {record.get("id"): record for record in document.all("edge")}
     lanes: dict[str, _Lane] = {}
     left_out: Counter[str] = Counter()
+    middle = -1 if document.get("lefthand", "false") in ("true", "1") else 1
     for edge in edges.values():
         for record in edge.all("lane"):
             kind, allowed = _find_kind(record, edge)
@@ -96,12 +99,12 @@ def read_net(path: Path, *, point_spacing_m: float, outline: OutlineNumbers, ele
                 continue
             xyz, width = polylines.densify(xyz, point_spacing_m), record.number("width", WIDTH_M)
             inner = edge.get("function", "") == INTERNAL
-            lanes[record.get("id")] = _Lane(len(lanes), kind, xyz, width, record.number("speed"), record, edge, allowed, inner)
+            lanes[record.get("id")] = _Lane(len(lanes), kind, xyz, width, record.number("speed"), record, edge, allowed, inner, middle)
     if not any(lane.kind != LANE_BIKE for lane in lanes.values()):
         raise SceneError(f"{document.where}: expected lanes for cars, got {sum(left_out.values())} others")
     links = _link(document, lanes)
     areas = [ring for lane in lanes.values() for ring in _widen(lane.xyz, lane.width)]
-    areas += _find_junction_areas(document, edges)
+    areas += _find_junction_areas(document, edges, lanes)
     ground = np.concatenate([lane.xyz for lane in lanes.values()])
     tree = KDTree(ground[:, :2])
     raised = lambda ring: np.column_stack([ring[:, :2], ground[tree.query(ring[:, :2])[1], 2]])  # noqa: E731
@@ -209,18 +212,18 @@ def _make_lanes(lanes: Mapping[str, _Lane]) -> Iterator[Polyline]:
             id=lane.id,
             entry=tuple(dict.fromkeys(lane.entry)),
             exit=tuple(dict.fromkeys(lane.exit)),
-            left=tuple(other.id for other in _find_beside(lane, lanes, "Left")),
-            right=tuple(other.id for other in _find_beside(lane, lanes, "Right")),
+            left=tuple(other.id for other in _find_beside(lane, lanes, lane.middle)),
+            right=tuple(other.id for other in _find_beside(lane, lanes, -lane.middle)),
             speed_limit=origin.limit if origin.limit > 0 else None,
         )
 
 
-def _find_beside(lane: _Lane, lanes: Mapping[str, _Lane], side: str) -> list[_Lane]:
-    """The neighbour on a side into which those who use the lane may change."""
-    other = lanes.get(f"{lane.edge.get('id')}_{lane.record.integer('index') + (1 if side == 'Left' else -1)}")
+def _find_beside(lane: _Lane, lanes: Mapping[str, _Lane], step: int) -> list[_Lane]:
+    """The lane with the next index, or the one before, into which those who use the lane may change; indices grow towards the middle."""
+    other = lanes.get(f"{lane.edge.get('id')}_{lane.record.integer('index') + step}")
     if other is None or other.kind != lane.kind or lane.inner:
         return []
-    permitted = lane.record.get(f"change{side}", "all").split()
+    permitted = lane.record.get("changeLeft" if step > 0 else "changeRight", "all").split()
     who = {CAR} & lane.allowed or lane.allowed  # where cars are allowed, they decide
     return [other] if who & other.allowed and ("all" in permitted or who & set(permitted)) else []
 
@@ -231,8 +234,9 @@ def _widen(xyz: Points, width: float) -> list[np.ndarray]:
     return [np.asarray(part.exterior.coords) for part in shapely.get_parts(area)]
 
 
-def _find_junction_areas(document: Element, edges: Mapping[str, Element]) -> Iterator[np.ndarray]:
-    """The outlines of junctions, without the pavements in them."""
+def _find_junction_areas(document: Element, edges: Mapping[str, Element], lanes: Mapping[str, _Lane]) -> Iterator[np.ndarray]:
+    """The outlines of the junctions at the ends of lanes, without the pavements in them."""
+    ends = {lane.edge.get(side, "") for lane in lanes.values() for side in ("from", "to")}
     walks: dict[str, list[Any]] = defaultdict(list)
     for name, edge in edges.items():
         if edge.get("function", "") == "walkingarea":
@@ -240,7 +244,7 @@ def _find_junction_areas(document: Element, edges: Mapping[str, Element]) -> Ite
             walks[name[1:].rpartition("_")[0]] += [shapely.make_valid(shapely.Polygon(ring[:, :2])) for ring in rings if len(ring) > 2]
     for record in document.all("junction"):
         shape = record.get("shape", "")
-        if record.get("type", "") == "internal" or len(shape.split()) < 3:
+        if record.get("type", "") == "internal" or record.get("id") not in ends or len(shape.split()) < 3:
             continue
         area = shapely.make_valid(shapely.Polygon(_read_points(record, shape)[:, :2]))
         for part in shapely.get_parts(shapely.difference(area, shapely.union_all(walks[record.get("id")]))):
@@ -250,27 +254,27 @@ def _find_junction_areas(document: Element, edges: Mapping[str, Element]) -> Ite
 
 def _find_marks(lanes: Mapping[str, _Lane], edges: Mapping[str, Element]) -> Iterator[tuple[int, Points]]:
     """The lines between the lanes of an edge, and between two directions of a street."""
-    leftmost: dict[tuple[str, str], Points] = {}
+    innermost: dict[tuple[str, str], Points] = {}
     for edge in edges.values():
         side = [lanes[name] for name in (record.get("id") for record in edge.all("lane")) if name in lanes]
         if edge.get("function", "") == INTERNAL or not side:
             continue
         for lane, other in itertools.pairwise(side):
             if other.record.integer("index") == lane.record.integer("index") + 1:
-                change = _find_beside(lane, lanes, "Left") and _find_beside(other, lanes, "Right")
+                change = _find_beside(lane, lanes, 1) and _find_beside(other, lanes, -1)
                 yield DASHED if change else SOLID, _offset(lane)
         line = _offset(side[-1])
-        facing = leftmost.get((edge.get("to", ""), edge.get("from", "")))
+        facing = innermost.get((edge.get("to", ""), edge.get("from", "")))
         if facing is not None and max(np.linalg.norm(line[0] - facing[-1]), np.linalg.norm(line[-1] - facing[0])) <= FACING_M:
             yield DASHED if side[-1].record.find("neigh") is not None else SOLID, line
-        leftmost[edge.get("from", ""), edge.get("to", "")] = line
+        innermost[edge.get("from", ""), edge.get("to", "")] = line
 
 
 def _offset(lane: _Lane) -> Points:
-    """The left border of a lane."""
+    """The border of a lane towards the middle of the street."""
     along = np.gradient(lane.xyz[:, :2], axis=0)
     aside = np.stack([-along[:, 1], along[:, 0]], axis=1) / np.linalg.norm(along, axis=1, keepdims=True)
-    return np.column_stack([lane.xyz[:, :2] + lane.width / 2 * aside, lane.xyz[:, 2]])
+    return np.column_stack([lane.xyz[:, :2] + lane.middle * lane.width / 2 * aside, lane.xyz[:, 2]])
 
 
 def _find_stop_signs(links: list[tuple[_Lane, _Lane, Element]], lanes: Mapping[str, _Lane], start: int) -> Iterator[Polyline]:

@@ -17,6 +17,7 @@ from scenefactory_jax.data.formats import file_content
 MAX_DEPTH = 64  # of elements within elements; OpenDRIVE has 10
 STARTS = (b"<", b"\xff\xfe", b"\xfe\xff")  # of text, and of the two orders of UTF-16
 MAX_TEXT = 60  # characters of a value in a message
+MAX_NUMBER = 1e15
 
 
 @dataclass(slots=True)
@@ -56,9 +57,9 @@ class Element:
             raise SceneError(f"{self.where}: {name}: missing; there are: {', '.join(self.attributes) or 'none'}")
         return text
 
-    def number(self, name: str, default: float | None = None) -> float:
-        """A finite number in an attribute."""
-        return self._convert(name, self.get(name, None if default is None else str(default)), float, "a finite number")
+    def number(self, name: str, default: float | None = None, *, limit: float = MAX_NUMBER) -> float:
+        """A finite number in an attribute, of up to `limit`."""
+        return self._convert(name, self.get(name, None if default is None else str(default)), float, "a finite number", limit)
 
     def integer(self, name: str, default: int | None = None) -> int:
         """An integer in an attribute."""
@@ -68,12 +69,12 @@ class Element:
         """The finite number that is the element's text."""
         return self._convert("text", self.text, float, "a finite number")
 
-    def _convert(self, name: str, text: str, kind: type, noun: str) -> Any:
+    def _convert(self, name: str, text: str, kind: type, noun: str, limit: float = MAX_NUMBER) -> Any:
         try:
             value = kind(text)
         except ValueError:
             value = math.nan
-        if not math.isfinite(value) or abs(value) > 1e15:
+        if not math.isfinite(value) or abs(value) > limit:
             raise SceneError(f"{self.where}: {name}: expected {noun}, got {text[:MAX_TEXT]!r}")
         return value
 

@@ -16,7 +16,7 @@ from scipy.spatial import KDTree
 from scenefactory_jax.core.instantiate import instantiate
 from scenefactory_jax.core.raw_scene import Light, LightPlan, Polyline, RawScene, Reject, Track
 from scenefactory_jax.core.schema import Count, NonNegative, Positive
-from scenefactory_jax.core.types import DRIVABLE, LANE_BIKE, RED_STATES, YELLOW_STATES
+from scenefactory_jax.core.types import DRIVABLE, EDGES, LANE_BIKE, LINES, RED_STATES, YELLOW_STATES
 from scenefactory_jax.data.generators.curves import FINE_M, arc_length, resample, tangents, wrap_angle
 from scenefactory_jax.data.generators.town import town_scene
 from scenefactory_jax.data.generators.town.intersections import TURN_RANK
@@ -26,7 +26,8 @@ from scenefactory_jax.data.generators.town.traffic_lights import CLOSED, CLOSING
 
 MAX_REDRAWS = 20  # places that are tried for a scene
 STRAIGHT_DEG = 30.0  # less turn of a lane of a junction is none
-BEYOND = 2.5  # lanes count up to so many times the reach
+BEYOND = 2.5  # a scene has the map up to so many times the reach
+PIECEWISE = (*LINES, *EDGES)  # kinds of which a scene has pieces
 EVERYWHERE = shapely.box(-1e6, -1e6, 1e6, 1e6)  # traffic keeps to lanes: it need not be checked for leaving a surface
 PACKAGE = "scenefactory_jax.data.generators.town"
 Phases = Sequence[Sequence[Sequence[int]]]  # junction -> groups of lanes (ids) that are green together
@@ -63,7 +64,7 @@ def draw_scenes(
 ) -> Iterator[RawScene | Reject]:
     """Draws `scenes` scenes on a map, or a reject in place of each for which no place with enough moving cars is found.
 
-    A scene depends on the map's name, its number and the numbers alone.
+    A scene depends on the map's name, its number and the numbers alone, and has the map around its middle.
 
     Args:
         reach_m: half the side of the square around its middle in which road users start.
@@ -85,18 +86,38 @@ def draw_scenes(
             rng = np.random.default_rng(np.random.SeedSequence((zlib.crc32(raw.name.encode()), number, redraw)))
             lane = lanes[int(rng.choice(len(lanes), p=lengths / lengths.sum()))]
             middle = lane.xyz[int(rng.integers(len(lane.xyz))), :2]
-            network, stops = _build_network(raw, phases, middle, BEYOND * reach_m, lane_width_m, speed_limit_mps)
+            part, near = cut_map(raw, phases, middle, BEYOND * reach_m)
+            network, stops = _build_network(part, near, middle, BEYOND * reach_m, lane_width_m, speed_limit_mps)
             every = add_warmup(times, warmup_s)
-            gates = _follow_plans(draw_gates(rng, network, every), raw, len(network.stops) - len(raw.lights), every)
+            gates = _follow_plans(draw_gates(rng, network, every), part, len(network.stops) - len(part.lights), every)
             recorded = town_scene.record(rng, populate(rng, network, [], EVERYWHERE, reach_m, every, gates), log)
             if recorded is not None:
                 users, sdc = recorded
                 tracks = tuple(_place(town_scene.to_track(i, user), middle, ground, heights) for i, user in enumerate(users))
-                lights = _make_lights(raw, stops, gates, log_steps)
-                scene = replace(raw, name=name, tracks=tracks, times=times, current=log_current, sdc=sdc, lights=lights)
+                lights = _make_lights(part, stops, gates, log_steps)
+                scene = replace(part, name=name, tracks=tracks, times=times, current=log_current, sdc=sdc, lights=lights)
                 break
         fault = f"traffic: {MAX_REDRAWS} places of the map had fewer than {log.min_cars} moving cars; give traffic=null for the map alone"
         yield Reject(name, fault) if scene is None else scene
+
+
+def cut_map(raw: RawScene, phases: Phases, middle: Float[np.ndarray, " 2"], half: float) -> tuple[RawScene, Phases]:
+    """The map in the square of half side `half` around `middle`: lanes, crosswalks and signs whole, of lines and edges the pieces there."""
+    roads, cut = [], []
+    for line in raw.roads:
+        near = np.abs(line.xyz[:, :2] - middle).max(axis=1) <= half
+        if near.all() or (near.any() and line.kind not in PIECEWISE):
+            roads.append(line)
+        elif near.any():
+            bounds = np.flatnonzero(np.diff(np.concatenate([[False], near, [False]]).astype(int))).reshape(-1, 2)
+            cut += [replace(line, xyz=line.xyz[start:stop]) for start, stop in bounds.tolist() if stop - start > 1]
+    first = max((line.id for line in raw.roads), default=-1) + 1
+    roads += [replace(piece, id=first + place) for place, piece in enumerate(cut)]
+    kept = {line.id for line in roads}
+    metadata = raw.metadata | {"intersection_lanes": [lane for lane in raw.metadata.get("intersection_lanes", ()) if lane in kept]}
+    lights = tuple(light for light in raw.lights if light.lane in kept)
+    near_phases = [[[lane for lane in group if lane in kept] for group in groups] for groups in phases]
+    return replace(raw, roads=tuple(roads), lights=lights, metadata=metadata), near_phases
 
 
 def _build_network(
