@@ -66,6 +66,13 @@ def compute_grade(ground: Ground, yaw: Float[Array, "*n"]) -> tuple[Float[Array,
     return rise * cosine, cosine
 
 
+def read_grade(scene: Scene, motion: Motion) -> Float[Array, " A"] | None:
+    """Computes the rise over run under cars along their headings; None if the road is flat."""
+    if scene.elevation is None:
+        return None
+    return dot(find_ground(scene.elevation, motion.position[:, :2], motion.position[:, 2]).slope, heading_vector(motion.yaw))
+
+
 def find_start_ground(scene: Scene) -> Ground | None:
     """Computes the road under the agents' starts."""
     return find_ground_by_lane(scene, scene.agents.position, scene.agents.yaw)

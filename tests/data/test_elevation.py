@@ -14,7 +14,7 @@ from scenefactory_jax.core.raw_scene import Polyline, RawScene, Track, Unpackabl
 from scenefactory_jax.core.types import DRIVABLE, Boxes, State
 from scenefactory_jax.data.formats import reader_selection
 from scenefactory_jax.data.loading import scene_source
-from scenefactory_jax.data.packing import elevation_grid, route_conflicts
+from scenefactory_jax.data.packing import elevation_grid, route_columns, route_conflicts
 from scenefactory_jax.data.packing.stack import stack
 from scenefactory_jax.dynamics import bicycle
 from scenefactory_jax.dynamics.articulated.parameters import GRAVITY
@@ -114,7 +114,8 @@ def test_routes_on_two_levels_do_not_meet():
         "road.midpoint": lines.reshape(-1, 2), "road.polyline": np.repeat([7, 8], 41),
     }  # fmt: skip
     for height, meet in ((BRIDGE_M, False), (0.0, True)):
-        zones = route_conflicts.find_zones(leaves | {"road.height": np.repeat([0.0, height], 41)})
+        heights = leaves | {"road.height": np.repeat([0.0, height], 41)}
+        zones = route_conflicts.find_zones(heights | route_columns.find_heights(heights))
         assert np.isfinite(zones["traffic_log.zone_enter"]).any() == meet
 
 
