@@ -12,7 +12,7 @@ from typing import Annotated
 import numpy as np
 import scipy.sparse
 import scipy.sparse.linalg
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from scipy.spatial import KDTree
 
 from scenefactory_jax.core.pytree import unchecked
@@ -24,6 +24,7 @@ from scenefactory_jax.data.formats.polylines import densify
 KINDS = (LANE_FREEWAY, LANE_STREET, LANE_BIKE, *LINES, *EDGES)  # whose points lie on the road; stop signs stand above it
 RIM = 2  # cells around the square
 OVERLAP = 1.5  # cells, within which two heights are those of one place
+HALF_CELL = 0.75  # cells, from a coefficient to any place nearest to it
 APART = 5.0  # cells, over which a level may go from the height of one road to that of another
 
 
@@ -51,13 +52,35 @@ def fit_elevation(raw: RawScene, origin: Float[np.ndarray, "3"], half: float, co
     points = _thin(points[(np.abs(points[:, :2]) <= -corner - config.cell_m).all(axis=1)], config.spacing_m)
     below, above = _assign_levels(points, config, raw.source)
     basis, bending = _evaluate_basis((points[:, :2] - corner) / config.cell_m, nodes), config.smoothing * _measure_bending(nodes)
-    height = np.zeros((config.levels, nodes, nodes), np.float32)
+    height, present = np.zeros((config.levels, nodes, nodes), np.float32), np.ones((config.levels, nodes, nodes), bool)
     for level in range(config.levels):
         own = (below <= level) & (above <= config.levels - 1 - level)
         rows = basis[own]
         if own.any():
             height[level].flat = scipy.sparse.linalg.spsolve((rows.T @ rows + bending).tocsc(), rows.T @ points[own, 2])
-    return unchecked(Elevation, height=height, origin=np.full(2, corner, np.float32), cell_m=np.float32(config.cell_m))
+            alone = own & (below + above == config.levels - 1)
+            present[level] = _find_present(points, own, alone, corner + config.cell_m * np.arange(nodes))
+    place = {"origin": np.full(2, corner, np.float32), "cell_m": np.float32(config.cell_m)}
+    return unchecked(Elevation, height=height, **place, present=present if config.levels > 1 else None)
+
+
+def _find_present(
+    points: Float[np.ndarray, "N 3"], own: Bool[np.ndarray, " N"], alone: Bool[np.ndarray, " N"], axis: Float[np.ndarray, " K"]
+) -> Bool[np.ndarray, "K K"]:
+    """Mask of the coefficients at which a level is there: around points of its own, less the cells in which it leaves other roads.
+
+    Args:
+        alone: of its own points those that are on no other level.
+    """
+    cell = axis[1] - axis[0]
+    nodes = np.stack(np.meshgrid(axis, axis), axis=-1)  # rows along y
+    near, other, crossing = (_measure_distance(points[mask, :2], nodes) for mask in (own, ~own, alone))
+    return (other > np.maximum(near, HALF_CELL * cell)) | (crossing <= OVERLAP * cell)
+
+
+def _measure_distance(points: Float[np.ndarray, "N 2"], nodes: Float[np.ndarray, "K K 2"]) -> Float[np.ndarray, "K K"]:
+    """Distances of the nearest point; inf without points."""
+    return KDTree(points).query(nodes)[0] if len(points) else np.full(nodes.shape[:2], np.inf)
 
 
 def stack_elevations(worlds: Sequence[Elevation | None]) -> Elevation | None:
@@ -71,7 +94,8 @@ def stack_elevations(worlds: Sequence[Elevation | None]) -> Elevation | None:
         raise ConfigError(f"scenes.pack.elevation: expected the same sizes in all scenes, got {', '.join(sorted(map(str, sizes)))}")
     if sizes == {None}:
         return None
-    return unchecked(Elevation, **{name: np.stack([getattr(world, name) for world in worlds]) for name in vars(worlds[0])})
+    parts = {name: [getattr(world, name) for world in worlds] for name in vars(worlds[0])}
+    return unchecked(Elevation, **{name: None if part[0] is None else np.stack(part) for name, part in parts.items()})
 
 
 def _thin(points: Float[np.ndarray, "N 3"], spacing_m: float) -> Float[np.ndarray, "M 3"]:

@@ -60,8 +60,10 @@ def project_boxes(window: Window, boxes: Boxes) -> Projection:
     place = dot(relative, direction[:, None])
     beyond = place - jnp.clip(place, 0.0, length[:, None])
     counts = usable[:, None]
-    if window.height is not None:
-        counts &= jnp.abs(window.height[:, None, :-1] - boxes.elevation[:, None]) < LEVEL_M
+    reach = 0.5 * boxes.size[None, :, 0]
+    if window.height is not None:  # else a chord far ahead may be at the height of a box under the route
+        beside = jnp.abs(beyond) <= reach[..., None]
+        counts = counts & beside & (jnp.abs(window.height[:, None, :-1] - boxes.elevation[:, None]) < LEVEL_M)
     distance = jnp.where(counts, cross(direction[:, None], relative) ** 2 + beyond**2, jnp.inf)
     best = jnp.argmin(distance, axis=2)  # [V, B]
     chord = lambda table: jnp.take_along_axis(table, best, axis=1)  # noqa: E731
@@ -71,7 +73,6 @@ def project_boxes(window: Window, boxes: Boxes) -> Projection:
     heading = heading_vector(boxes.yaw)[None]
     low, high = window.arc[:, :1], jnp.max(window.arc, axis=1, keepdims=True)
     meets = chord(usable) if window.height is None else jnp.any(counts, axis=2)
-    reach = 0.5 * boxes.size[None, :, 0]
     return Projection(
         arc=arc,
         offset=cross(ahead, from_start),
