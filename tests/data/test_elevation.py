@@ -104,6 +104,20 @@ def test_levels_are_told_apart_by_height_and_by_the_lanes_direction(crossing):
     assert edges[1, near & ~along].all() and not edges[1, near & along].any()
 
 
+def test_who_follows_a_road_stays_on_it(crossing):
+    """A wheel that sinks 2 cm into the road, and whose height chooses the level, over each lane in both directions."""
+    numbers = load_config("train", "scenes=womd", "scenes/pack/elevation=hills", "scenes.pack.elevation.levels=2")["scenes"]["pack"]["elevation"]
+    fit = to_jax(elevation_grid.fit_elevation(crossing, np.zeros(3), 100.0, elevation_grid.ElevationConfig(**numbers)))
+    lanes = np.stack([way for line in crossing.roads if line.kind in DRIVABLE for way in (line.xyz, line.xyz[::-1])]).astype(np.float32)
+
+    def roll(height, place):
+        found = elevation.find_ground(fit, place, height - 0.02).height
+        return found, found
+
+    heights = jax.jit(jax.vmap(lambda lane: jax.lax.scan(roll, lane[0, 2], lane[:, :2])[1]))(lanes)
+    np.testing.assert_allclose(heights, lanes[..., 2], atol=0.05)
+
+
 def test_routes_on_two_levels_do_not_meet():
     """A route along x and one along y over it, or on the same ground."""
     way = np.arange(-20.0, 21.0)

@@ -11,6 +11,7 @@ from typing import Annotated
 
 import numpy as np
 import scipy.sparse
+import scipy.sparse.csgraph
 import scipy.sparse.linalg
 from jaxtyping import Bool, Float, Int
 from scipy.spatial import KDTree
@@ -26,6 +27,7 @@ RIM = 2  # cells around the square
 OVERLAP = 1.5  # cells, within which two heights are those of one place
 HALF_CELL = 0.75  # cells, from a coefficient to any place nearest to it
 APART = 5.0  # cells, over which a level may go from the height of one road to that of another
+LINK, STEEP = 1.25, 3.0  # cells between points of one road, in which heights count three times
 
 
 @dataclass(frozen=True)
@@ -112,28 +114,39 @@ def _assign_levels(points: Float[np.ndarray, "N 3"], config: ElevationConfig, so
     below, above = np.zeros((2, len(points)), int)
     if not len(points) or np.ptp(points[:, 2]) <= config.rise_m:
         return below, above
-    below, above = _count_levels(points, config, OVERLAP * config.cell_m)
+    below, above = _count_levels(points, config)
     if (deepest := int((below + above).max()) + 1) > config.levels:
         raise Unpackable("levels", f"{source}: roads: {deepest} levels at one place; scenes.pack.elevation.levels is {config.levels}")
     if deepest > 1:
-        below, above = _count_levels(points, config, APART * config.cell_m)
+        source_of = _spread_along_roads(points, below + above > 0, config.cell_m)
+        below, above = (np.where(source_of >= 0, counts[source_of], 0) for counts in (below, above))
     below = np.minimum(below, config.levels - 1)
     return below, np.minimum(above, config.levels - 1 - below)
 
 
-def _count_levels(
-    points: Float[np.ndarray, "N 3"], config: ElevationConfig, reach_m: float
-) -> tuple[Int[np.ndarray, " N"], Int[np.ndarray, " N"]]:
-    """Levels below and above each point, among the points within a reach: their heights in order, divided at gaps of `rise_m`."""
+def _count_levels(points: Float[np.ndarray, "N 3"], config: ElevationConfig) -> tuple[Int[np.ndarray, " N"], Int[np.ndarray, " N"]]:
+    """Levels below and above each point, among the points within OVERLAP: their heights in order, divided at gaps of `rise_m`."""
     below, above = np.zeros((2, len(points)), int)
     coarse = _thin(points, config.cell_m)
-    near = KDTree(coarse[:, :2]).query_ball_point(points[:, :2], reach_m)
+    near = KDTree(coarse[:, :2]).query_ball_point(points[:, :2], OVERLAP * config.cell_m)
     for row, others in enumerate(near):
         height = np.sort(np.append(coarse[others, 2], points[row, 2]))
         gaps = height[1:][np.diff(height) > config.rise_m]  # lowest heights of the levels but the first
         below[row] = (gaps <= points[row, 2]).sum()
         above[row] = len(gaps) - below[row]
     return below, above
+
+
+def _spread_along_roads(points: Float[np.ndarray, "N 3"], crossing: Bool[np.ndarray, " N"], cell_m: float) -> Int[np.ndarray, " N"]:
+    """For each point the nearest one at a crossing along roads, by its row; -1 where there is none within APART."""
+    near = np.flatnonzero(KDTree(points[crossing, :2]).query(points[:, :2])[0] <= APART * cell_m)
+    tree = KDTree(points[near] * [1.0, 1.0, STEEP])
+    ways = tree.sparse_distance_matrix(tree, LINK * cell_m, output_type="coo_matrix").tocsr()
+    starts = np.flatnonzero(crossing[near])
+    *_, found = scipy.sparse.csgraph.dijkstra(ways, indices=starts, limit=APART * cell_m, min_only=True, return_predecessors=True)
+    source = np.full(len(points), -1)
+    source[near[found >= 0]] = near[found[found >= 0]]
+    return source
 
 
 def _evaluate_basis(place: Float[np.ndarray, "N 2"], nodes: int) -> scipy.sparse.csr_array:
