@@ -106,8 +106,9 @@ def test_levels_are_told_apart_by_height_and_by_the_lanes_direction(crossing):
 
 def test_who_follows_a_road_stays_on_it(crossing):
     """A wheel that sinks 2 cm into the road, and whose height chooses the level, over each lane in both directions."""
-    numbers = load_config("train", "scenes=womd", "scenes/pack/elevation=hills", "scenes.pack.elevation.levels=2")["scenes"]["pack"]["elevation"]
-    fit = to_jax(elevation_grid.fit_elevation(crossing, np.zeros(3), 100.0, elevation_grid.ElevationConfig(**numbers)))
+    config = load_config("train", "scenes=womd", "scenes/pack/elevation=hills", "scenes.pack.elevation.levels=2")["scenes"]
+    numbers = elevation_grid.ElevationConfig(**config["pack"]["elevation"])
+    fit = to_jax(elevation_grid.fit_elevation(crossing, np.zeros(3), 100.0, numbers))
     lanes = np.stack([way for line in crossing.roads if line.kind in DRIVABLE for way in (line.xyz, line.xyz[::-1])]).astype(np.float32)
 
     def roll(height, place):

@@ -53,7 +53,7 @@ def fit_elevation(raw: RawScene, origin: Float[np.ndarray, "3"], half: float, co
     points = np.concatenate([np.zeros((0, 3)), *lines])
     points = _thin(points[(np.abs(points[:, :2]) <= -corner - config.cell_m).all(axis=1)], config.spacing_m)
     below, above = _assign_levels(points, config, raw.source)
-    basis, bending = _evaluate_basis((points[:, :2] - corner) / config.cell_m, nodes), config.smoothing * _measure_bending(nodes)
+    basis, bending = evaluate_basis((points[:, :2] - corner) / config.cell_m, nodes), config.smoothing * _measure_bending(nodes)
     height, present = np.zeros((config.levels, nodes, nodes), np.float32), np.ones((config.levels, nodes, nodes), bool)
     for level in range(config.levels):
         own = (below <= level) & (above <= config.levels - 1 - level)
@@ -149,7 +149,7 @@ def _spread_along_roads(points: Float[np.ndarray, "N 3"], crossing: Bool[np.ndar
     return source
 
 
-def _evaluate_basis(place: Float[np.ndarray, "N 2"], nodes: int) -> scipy.sparse.csr_array:
+def evaluate_basis(place: Float[np.ndarray, "N 2"], nodes: int) -> scipy.sparse.csr_array:
     """Weights of the coefficients at places in cells from the first coefficient, [N, nodes^2]."""
     node = np.clip(np.floor(place + 0.5), 1, nodes - 2)
     offset = place - node
