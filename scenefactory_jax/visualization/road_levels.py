@@ -45,10 +45,10 @@ def measure_road(scene: Scene, places: Float[np.ndarray, "*n 2"], near: Float[np
     return np.take_along_axis(height, level[None], axis=0)[0].reshape(np.shape(near))
 
 
-def find_covered(scene: Scene, places: Float[np.ndarray, "*n 2"], near: Float[np.ndarray, "*n"]) -> Bool[np.ndarray, "*n"]:
-    """Mask of what is under a bridge: another level of the road is there, higher than the one nearest to `near`, m."""
-    if scene.elevation is None:
-        return np.zeros(np.shape(near), bool)
+def find_covered(scene: Scene, places: Float[np.ndarray, "*n 2"], near: Float[np.ndarray, "*n"] | None) -> Bool[np.ndarray, "*n"]:
+    """Mask of what is under a bridge: another level of the road is there, higher than the one nearest to `near`, m. None: nothing is."""
+    if scene.elevation is None or near is None:
+        return np.zeros(np.shape(places)[:-1], bool)
     height, present = _evaluate(scene.elevation, np.asarray(places, float).reshape(-1, 2))
     own = measure_road(scene, places, near).ravel()
     return (present & (height - own > APART_M)).any(axis=0).reshape(np.shape(near))

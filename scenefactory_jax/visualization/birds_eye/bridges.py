@@ -3,7 +3,7 @@
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool
 from PIL import Image, ImageChops
 
 from scenefactory_jax.core.trajectory import Trajectory
@@ -28,13 +28,5 @@ def find_bridges(trajectory: Trajectory, view: View) -> Bridges:
     mask = change and change.convert("L").point(lambda value: 255 if value else 0)
     traffic = trajectory.traffic
     boxes = (np.zeros((len(trajectory.active), 0, 2)), None) if traffic is None else (traffic.position, traffic.elevation)
-    cars, others = (_find_covered(trajectory, *users) for users in ((trajectory.position, trajectory.height), boxes))
+    cars, others = (road_levels.find_covered(trajectory.scene, *users) for users in ((trajectory.position, trajectory.height), boxes))
     return Bridges(mask, cars, others)
-
-
-def _find_covered(
-    trajectory: Trajectory, position: Float[np.ndarray, "T N 2"], height: Float[np.ndarray, "T N"] | None
-) -> Bool[np.ndarray, "T N"]:
-    if height is None:
-        return np.zeros(position.shape[:2], bool)
-    return road_levels.find_covered(trajectory.scene, position, height)
