@@ -21,11 +21,13 @@ class TrafficBoxes(NamedTuple):
     @classmethod
     def from_boxes(cls, boxes: Boxes) -> "TrafficBoxes":
         """The columns of `boxes` that are drawn; boxes have a leading time axis."""
-        return cls(*(None if (column := getattr(boxes, name)) is None else np.asarray(column) for name in cls._fields))
+        elevation = None if boxes.elevation is None else np.asarray(boxes.elevation)
+        return cls(*(np.asarray(getattr(boxes, name)) for name in cls._fields[:-1]), elevation=elevation)
 
     def clip(self, first: int, last: int) -> "TrafficBoxes":
         """Steps `first` to `last`, without `last`."""
-        return TrafficBoxes(*(None if column is None else column[first:last] for column in self))
+        elevation = None if self.elevation is None else self.elevation[first:last]
+        return TrafficBoxes(*(column[first:last] for column in self[:4]), elevation=elevation)
 
 
 class Trajectory(NamedTuple):

@@ -51,7 +51,7 @@ def find_covered(scene: Scene, places: Float[np.ndarray, "*n 2"], near: Float[np
         return np.zeros(np.shape(places)[:-1], bool)
     height, present = _evaluate(scene.elevation, np.asarray(places, float).reshape(-1, 2))
     own = measure_road(scene, places, near).ravel()
-    return (present & (height - own > APART_M)).any(axis=0).reshape(np.shape(near))
+    return np.any(present & (height - own > APART_M), axis=0).reshape(np.shape(near))
 
 
 def _evaluate(elevation: Elevation, places: Float[np.ndarray, "N 2"]) -> tuple[Float[np.ndarray, "V N"], Bool[np.ndarray, "V N"]]:

@@ -95,9 +95,10 @@ def planning(
     mu = jnp.full_like(motion.yaw, jnp.inf)
     if friction_ahead_m is not None and friction is not None:
         mu = jnp.min(friction_ahead(scene, state, ahead_m=friction_ahead_m, friction=friction), axis=1)
+    velocity = to_frame(motion.velocity[:, :2], motion.yaw)
     line = read_centre_line(scene, state, behind_m=behind_m, ahead_m=ahead_m)
     return PlanningView(
-        velocity=to_frame(motion.velocity[:, :2], motion.yaw),
+        velocity=velocity,
         yaw_rate=motion.yaw_rate,
         steer=motion.steer,
         size=state.agents.size,

@@ -44,10 +44,9 @@ def read_window(routes: Routes, route: Int[Array, " V"], arc: Float[Array, " V"]
     count = routes.position.shape[1]
     first = jnp.clip(jnp.floor(arc / ROUTE_SPACING_M).astype(jnp.int32), 0, max(count - 2, 0))
     row = jnp.minimum(first[:, None] + stride * jnp.arange(points), count - 1)
-    flat = route[:, None] * count + row
-    height = None if routes.height is None else routes.height.reshape(-1)[flat]
-    arc = jnp.minimum(ROUTE_SPACING_M * row, routes.length[route][:, None])
-    return Window(routes.position.reshape(-1, 2)[flat], arc, row, height)
+    table, place = routes.position.reshape(-1, 2), route[:, None] * count + row
+    point, arc = table[place], jnp.minimum(ROUTE_SPACING_M * row, routes.length[route][:, None])
+    return Window(point, arc, row, None if routes.height is None else routes.height.reshape(-1)[place])
 
 
 def project_boxes(window: Window, boxes: Boxes) -> Projection:
@@ -59,11 +58,11 @@ def project_boxes(window: Window, boxes: Boxes) -> Projection:
     relative = boxes.position[None, :, None] - start[:, None]  # [V, B, K-1, 2]
     place = dot(relative, direction[:, None])
     beyond = place - jnp.clip(place, 0.0, length[:, None])
-    counts = usable[:, None]
-    reach = 0.5 * boxes.size[None, :, 0]
+    counts, present = usable[:, None], None
     if window.height is not None:  # else a chord far ahead may be at the height of a box under the route
-        beside = jnp.abs(beyond) <= reach[..., None]
+        beside = jnp.abs(beyond) <= 0.5 * boxes.size[None, :, :1]
         counts = counts & beside & (jnp.abs(window.height[:, None, :-1] - boxes.elevation[:, None]) < LEVEL_M)
+        present = boxes.present & jnp.any(counts, axis=2)
     distance = jnp.where(counts, cross(direction[:, None], relative) ** 2 + beyond**2, jnp.inf)
     best = jnp.argmin(distance, axis=2)  # [V, B]
     chord = lambda table: jnp.take_along_axis(table, best, axis=1)  # noqa: E731
@@ -72,7 +71,7 @@ def project_boxes(window: Window, boxes: Boxes) -> Projection:
     arc = chord(window.arc[:, :-1]) + dot(ahead, from_start)
     heading = heading_vector(boxes.yaw)[None]
     low, high = window.arc[:, :1], jnp.max(window.arc, axis=1, keepdims=True)
-    meets = chord(usable) if window.height is None else jnp.any(counts, axis=2)
+    reach = 0.5 * boxes.size[None, :, 0]
     return Projection(
         arc=arc,
         offset=cross(ahead, from_start),
@@ -80,7 +79,7 @@ def project_boxes(window: Window, boxes: Boxes) -> Projection:
         sine=cross(ahead, heading),
         speed=dot(ahead, boxes.velocity[None]),
         drift=cross(ahead, boxes.velocity[None]),
-        valid=boxes.present[None] & meets & (arc >= low - reach) & (arc <= high + reach),
+        valid=(boxes.present[None] if present is None else present) & chord(usable) & (arc >= low - reach) & (arc <= high + reach),
     )
 
 

@@ -72,13 +72,13 @@ def _find_level(scene: Scene, level: RoadLevel) -> list[Surface]:
     lines = [(shapely.LineString(points), kind) for points, kind in join_segments(level.road)]
     lanes = [line.buffer(LANE_M, quad_segs=4) for line, kind in lines if kind in (*LAYERS["lane"], *LAYERS["bike"])]
     asphalt = shapely.union_all(lanes).buffer(CLOSING_M, quad_segs=3).buffer(-CLOSING_M, quad_segs=3)
-    flat = [("asphalt", shapely.simplify(asphalt, STRAIGHT_M), ASPHALT_M, ASPHALT)]
+    flat: list[tuple[str, shapely.Geometry, float, Colour]] = [("asphalt", shapely.simplify(asphalt, STRAIGHT_M), ASPHALT_M, ASPHALT)]
     for name, look in LOOKS.items():
         shapes = [_shape(line, look) for line, kind in lines if kind in LAYERS[name]]
         flat.append((name, shapely.union_all(shapes), look.height_m, look.colour))
     if level.number is None:
         return [prism(*surface) for surface in flat]
-    cut = [prism(f"{name}{level.number or ''}", cut_to_cells(shape), *look) for name, shape, *look in flat]
+    cut = [prism(f"{name}{level.number or ''}", cut_to_cells(shape), height, colour) for name, shape, height, colour in flat]
     return [drape(surface, lambda places: measure_level(scene, places, level.number)) for surface in cut]
 
 

@@ -95,7 +95,8 @@ def _add_cars(packer: Packer, shots: StepRecord, active: Bool[np.ndarray, "T A"]
 
 def _cars(scene: Scene, shots: StepRecord, active: Bool[np.ndarray, "T A"], shown: Int[np.ndarray, "T A"]) -> list[dict[str, Any]]:
     """Slot, size, spans of active steps and of those under a bridge, and goals with their first step, of every present car."""
-    cars, covered = [], find_covered(scene, shots.position, shots.height)
+    height = None if shots.height is None else np.asarray(shots.height)
+    cars, covered = [], find_covered(scene, np.asarray(shots.position), height)
     for car in np.flatnonzero(np.asarray(scene.agents.present) | active.any(axis=0)).tolist():
         goal = shots.goal[shown[:, car], car]
         begins = np.flatnonzero(np.r_[True, (goal[1:] != goal[:-1]).any(axis=1)]).tolist()
