@@ -5,7 +5,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float
 
-from scenefactory_jax.core.pytree import replace
+from scenefactory_jax.core.pytree import unchecked
 from scenefactory_jax.core.types import Elevation, Road, Scene
 from scenefactory_jax.data.packing.elevation_grid import evaluate_basis
 
@@ -28,7 +28,8 @@ def list_levels(scene: Scene) -> list[RoadLevel]:
     apart = np.where(present, np.abs(height - np.asarray(road.height)), np.inf)
     level = np.argmax(apart <= apart.min(axis=0) + APART_M, axis=0)
     masks = [np.asarray(road.valid, bool) & (level == number) for number in range(len(height))]
-    return [RoadLevel(replace(road, valid=mask), number) for number, mask in enumerate(masks) if number == 0 or mask.any()]
+    shown = [(number, mask) for number, mask in enumerate(masks) if number == 0 or mask.any()]
+    return [RoadLevel(unchecked(Road, **vars(road) | {"valid": mask}), number) for number, mask in shown]
 
 
 def measure_level(scene: Scene, places: Float[np.ndarray, "N 2"], number: int | None) -> Float[np.ndarray, " N"]:

@@ -10,6 +10,8 @@ from scenefactory_jax.core.raw_scene import Polyline, RawScene, Track
 from scenefactory_jax.data.loading import scene_source
 from scenefactory_jax.env.environment import make_env
 from scenefactory_jax.learning.training_loop import make_policy
+from scenefactory_jax.visualization import road_levels
+from scenefactory_jax.visualization.mujoco import ground_meshes
 
 pytestmark = pytest.mark.usefixtures("quickly")
 
@@ -81,3 +83,17 @@ def test_cars_keep_their_level_and_reach_their_goals(driven):
     assert events.goal_reached.any(axis=0).all()
     assert not {name for name, event in vars(events).items() if event.any()} - {"goal_reached"}
     assert not leader[..., 0].any() and metrics.speed[active].min() > SPEED_MPS - 0.1, "nothing is ahead of them"
+
+
+def test_pictures_have_the_heights_of_each_level(driven, scene):
+    motion, *_, active = jax.device_get(driven)
+    world = jax.tree.map(np.asarray, scene)
+    covered = road_levels.find_covered(world, motion.position[..., :2], motion.position[..., 2])
+    middle = np.abs(motion.position[:, UNDER, 0] - 50.0) < 3.0
+    assert covered[middle, UNDER].all() and not covered[~middle & active[:, UNDER], UNDER].all() and not covered[:, OVER].any()
+    lowest, bridge = road_levels.list_levels(world)
+    assert bridge.road.valid.any() and not (lowest.road.valid & bridge.road.valid).any()
+    np.testing.assert_array_equal(lowest.road.valid | bridge.road.valid, world.road.valid)
+    found = {surface.name: surface.vertices for surface in ground_meshes.find_surfaces(world)}
+    tops = found["asphalt1"][found["asphalt1"][:, 2] > 1.0]
+    np.testing.assert_allclose(tops[:, 2], rise(tops[:, :2] + [-50.0, -2.0]), atol=0.15)
