@@ -96,4 +96,4 @@ def test_pictures_have_the_heights_of_each_level(driven, scene):
     np.testing.assert_array_equal(lowest.road.valid | bridge.road.valid, world.road.valid)
     found = {surface.name: surface.vertices for surface in ground_meshes.find_surfaces(world)}
     tops = found["asphalt1"][found["asphalt1"][:, 2] > 1.0]
-    np.testing.assert_allclose(tops[:, 2], rise(tops[:, :2] + [-50.0, -2.0]), atol=0.15)
+    np.testing.assert_allclose(tops[:, 2], rise(tops[:, :2] + [-50.0, -2.0]), atol=0.3)
