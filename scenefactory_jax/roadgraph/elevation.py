@@ -7,7 +7,7 @@ chapter IX): with the nearest node (i, j) and the offset (s, t) from it in cells
 
 Height and slope are continuous, and a plane is exact. Beyond the grid the height goes on along its tangent. Where roads cross on several
 levels, there is one height a level; everywhere else the levels are equal. Between, a level that leaves the road is absent: nothing on
-that road can follow it.
+that road follows it, but what is beside the road may be on it.
 """
 
 from typing import Any, NamedTuple
@@ -53,7 +53,7 @@ def _find_ground(elevation: Elevation, position: Float[Array, "2"], near: Float[
     apart = jnp.abs(height - near)
     if elevation.present is not None:
         there = jax.lax.dynamic_slice(elevation.present, (0, first[1] + 1, first[0] + 1), (levels, 1, 1))[:, 0, 0]
-        apart = jnp.where(there, apart, jnp.inf)
+        apart = jnp.where(there, apart, apart + LEVEL_M)  # a car beside a ramp is not lifted onto it
     level = jnp.argmin(apart)
     return Ground(height[level], slope[level] / elevation.cell_m)
 

@@ -8,6 +8,7 @@ from jaxtyping import Bool, Float
 from scenefactory_jax.core.pytree import unchecked
 from scenefactory_jax.core.types import Elevation, Road, Scene
 from scenefactory_jax.data.packing.elevation_grid import evaluate_basis
+from scenefactory_jax.roadgraph.elevation import LEVEL_M
 
 APART_M = 1.0  # levels that are nearer to each other are one
 
@@ -42,7 +43,7 @@ def measure_road(scene: Scene, places: Float[np.ndarray, "*n 2"], near: Float[np
     if scene.elevation is None:
         return np.zeros(np.shape(near))
     height, present = _evaluate(scene.elevation, np.asarray(places, float).reshape(-1, 2))
-    level = np.argmin(np.where(present, np.abs(height - np.ravel(near)), np.inf), axis=0)
+    level = np.argmin(np.abs(height - np.ravel(near)) + np.where(present, 0.0, LEVEL_M), axis=0)
     return np.take_along_axis(height, level[None], axis=0)[0].reshape(np.shape(near))
 
 

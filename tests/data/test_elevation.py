@@ -87,6 +87,8 @@ def test_levels_are_told_apart_by_height_and_by_the_lanes_direction(crossing):
     for road in crossing.roads:
         points = jnp.asarray(road.xyz - [-1.0, 2.0, 0.0], jnp.float32)  # around the first car
         np.testing.assert_allclose(FIND(scene.elevation, points[:, :2], points[:, 2]).height, points[:, 2], atol=0.05)
+    beside = jnp.tile(jnp.array([9.0, -15.0]), (len(LINE), 1))  # of the ramp, 4 m below it
+    assert np.abs(FIND(scene.elevation, beside, jnp.zeros(len(LINE))).height).max() < 2.0, "a car there is not lifted onto the ramp"
 
     @jax.jit
     def look(scene):
