@@ -3,6 +3,8 @@
 import jax
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
+from support.driving import CAR
 
 from scenefactory_jax.cli.hydra_config import apply_overrides, load_config
 from scenefactory_jax.core.pytree import to_jax
@@ -11,7 +13,7 @@ from scenefactory_jax.data.loading import scene_source
 from scenefactory_jax.env.environment import make_env
 from scenefactory_jax.learning.training_loop import make_policy
 from scenefactory_jax.visualization import road_levels
-from scenefactory_jax.visualization.mujoco import ground_meshes
+from scenefactory_jax.visualization.mujoco import ground_meshes, scene_model
 
 pytestmark = pytest.mark.usefixtures("quickly")
 
@@ -97,3 +99,15 @@ def test_pictures_have_the_heights_of_each_level(driven, scene):
     found = {surface.name: surface.vertices for surface in ground_meshes.find_surfaces(world)}
     tops = found["asphalt1"][found["asphalt1"][:, 2] > 1.0]
     np.testing.assert_allclose(tops[:, 2], rise(tops[:, :2] + [-50.0, -2.0]), atol=0.3)
+
+
+def test_level_cars_are_put_on_the_road(scene):
+    """A car that drives north up the bridge: its axes are along the road and across it."""
+    place, yaw, zero = np.array([[52.0, -30.0], [10.0, 0.0]]), np.array([np.pi / 2, 0.3]), np.zeros(2)
+    joints = scene_model.set_posture(CAR, place, yaw, zero, zero)
+    stood = scene_model.stand_on_road(jax.tree.map(np.asarray, scene), joints, np.array([4.0, 0.0]))
+    np.testing.assert_allclose(stood[:, 2] - joints[:, 2], [rise(place[0] + np.array([-50.0, -2.0])), 0.0], atol=0.03)
+    turn = Rotation.from_quat(np.roll(stood[:, 3:7], -1, axis=1)).as_matrix()
+    slope = np.diff(rise(np.array([[2.0, -32.1], [2.0, -31.9]])))[0] / 0.2
+    np.testing.assert_allclose(turn[0, :, 0], np.array([0.0, 1.0, slope]) / np.hypot(1.0, slope), atol=0.02)
+    np.testing.assert_allclose(turn[1, :, 0], [np.cos(0.3), np.sin(0.3), 0.0], atol=0.02)

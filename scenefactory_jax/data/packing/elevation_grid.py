@@ -25,7 +25,7 @@ from scenefactory_jax.data.formats.polylines import densify
 KINDS = (LANE_FREEWAY, LANE_STREET, LANE_BIKE, *LINES, *EDGES)  # whose points lie on the road; stop signs stand above it
 RIM = 2  # cells around the square
 OVERLAP = 1.5  # cells, within which two heights are those of one place
-HALF_CELL = 0.75  # cells, from a coefficient to any place nearest to it
+CLEAR = 1.75  # cells, within which a level that ends bends away from the road
 APART = 5.0  # cells, over which a level may go from the height of one road to that of another
 LINK, STEEP = 1.25, 3.0  # cells between points of one road, in which heights count three times
 
@@ -77,7 +77,7 @@ def _find_present(
     cell = axis[1] - axis[0]
     nodes = np.stack(np.meshgrid(axis, axis), axis=-1)  # rows along y
     near, other, crossing = (_measure_distance(points[mask, :2], nodes) for mask in (own, ~own, alone))
-    return (other > np.maximum(near, HALF_CELL * cell)) | (crossing <= OVERLAP * cell)
+    return (other > np.maximum(near, CLEAR * cell)) | (crossing <= OVERLAP * cell)
 
 
 def _measure_distance(points: Float[np.ndarray, "N 2"], nodes: Float[np.ndarray, "K K 2"]) -> Float[np.ndarray, "K K"]:

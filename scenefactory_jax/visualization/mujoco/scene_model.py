@@ -97,8 +97,8 @@ def stand_on_road(scene: Scene, joints: Float[np.ndarray, "*n 17"], near: Float[
     stood[..., 2] += here
     # the shortest turn from the world's up to the road's, after the car's own yaw
     tilt = Rotation.from_rotvec(_find_turns(east, north))
-    turn = tilt * Rotation.from_quat(joints[..., 3:7].reshape(-1, 4), scalar_first=True)
-    stood[..., 3:7] = turn.as_quat(scalar_first=True).reshape(*np.shape(near), 4)
+    turn = tilt * Rotation.from_quat(np.roll(joints[..., 3:7].reshape(-1, 4), -1, axis=1))  # SciPy's scalar comes last
+    stood[..., 3:7] = np.roll(turn.as_quat(), 1, axis=1).reshape(*np.shape(near), 4)
     return stood
 
 
