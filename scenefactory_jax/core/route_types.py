@@ -1,6 +1,7 @@
 """Types of routes and of traffic control, which `core.types` passes on. Axes are described there."""
 
 import dataclasses
+import types
 from typing import Literal, TypeVar, get_args
 
 import jax.numpy as jnp
@@ -38,6 +39,7 @@ class Routes:
     on_route: Bool[Array, " R"]  # it begins with the lanes of the logged track (planning facts: ScenarioMax)
     stop_arc: Float[Array, "R S"]  # arc length at the stop lines, ascending; inf behind the last
     stop_control: Int[Array, "R S"]  # row of `Scene.controls`
+    height: Float[Array, "R N"] | None = None  # of the points; None: the scene has one level
 
 
 @pytree_dataclass
@@ -68,6 +70,8 @@ def make_empty_rows(kind: type[T]) -> T:
     dtypes = {"float": jnp.float32, "int": jnp.int32, "bool": jnp.bool_}
     leaves = {}
     for entry in dataclasses.fields(kind):  # pyright: ignore[reportArgumentType]
+        if isinstance(entry.type, types.UnionType):  # a part that may be missing
+            continue
         dtype = next(dtype for name, dtype in dtypes.items() if entry.type.dtypes[0].startswith(name))  # pyright: ignore
         shape = [int(axis) if axis.isdigit() else 0 for axis in entry.type.dim_str.split()]  # pyright: ignore
         leaves[entry.name] = jnp.zeros(shape, dtype)

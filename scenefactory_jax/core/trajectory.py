@@ -16,15 +16,18 @@ class TrafficBoxes(NamedTuple):
     yaw: Float[np.ndarray, "T O"]
     size: Float[np.ndarray, "T O 2"]  # length, width
     present: Bool[np.ndarray, "T O"]
+    elevation: Float[np.ndarray, "T O"] | None = None  # of the boxes' centres; None: not known
 
     @classmethod
     def from_boxes(cls, boxes: Boxes) -> "TrafficBoxes":
         """The columns of `boxes` that are drawn; boxes have a leading time axis."""
-        return cls(*(np.asarray(getattr(boxes, name)) for name in cls._fields))
+        elevation = None if boxes.elevation is None else np.asarray(boxes.elevation)
+        return cls(*(np.asarray(getattr(boxes, name)) for name in cls._fields[:-1]), elevation=elevation)
 
     def clip(self, first: int, last: int) -> "TrafficBoxes":
         """Steps `first` to `last`, without `last`."""
-        return TrafficBoxes(*(column[first:last] for column in self))
+        elevation = None if self.elevation is None else self.elevation[first:last]
+        return TrafficBoxes(*(column[first:last] for column in self[:4]), elevation=elevation)
 
 
 class Trajectory(NamedTuple):
@@ -50,6 +53,7 @@ class Trajectory(NamedTuple):
     weather: str
     traffic: TrafficBoxes | None = None  # None: agents only
     start_s: float = 0.0  # time of the first step since the cars start, by which lights are read
+    height: Float[np.ndarray, "T A"] | None = None  # of the cars' centres, where roads have several levels
 
     def clip(self, first: int, last: int) -> "Trajectory":
         """Steps `first` to `last`, without `last`."""
@@ -60,4 +64,5 @@ class Trajectory(NamedTuple):
             events={name: new[first:last] for name, new in self.events.items()},
             traffic=self.traffic and self.traffic.clip(first, last),
             start_s=self.start_s + max(first, 0) / self.control_hz,
+            height=None if self.height is None else self.height[first:last],
         )

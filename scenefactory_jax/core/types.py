@@ -172,6 +172,7 @@ class Elevation:
     height: Float[Array, "V Y X"]  # coefficients, level after level, m
     origin: Float[Array, "2"]  # place of the first coefficient
     cell_m: Float[Array, ""]  # between coefficients
+    present: Bool[Array, "V Y X"] | None = None  # the level is there, in the cell around the coefficient; None: everywhere
 
 
 @pytree_dataclass

@@ -10,7 +10,7 @@ from scenefactory_jax.core.schema import Bounds, NonNegative, Positive
 from scenefactory_jax.core.types import ROUTE_SPACING_M, RewardInput
 from scenefactory_jax.env import planning_metrics, surrogate_safety
 from scenefactory_jax.env.history import SPACING_S, need_history
-from scenefactory_jax.roadgraph.signed_edge_distance import compute_signed_distance, list_edge_points
+from scenefactory_jax.roadgraph.signed_edge_distance import append_height, compute_signed_distance, list_edge_points
 
 
 def find_contacts(step: RewardInput) -> Bool[Array, "A B"]:
@@ -20,7 +20,9 @@ def find_contacts(step: RewardInput) -> Bool[Array, "A B"]:
     cars = len(active)
     own = (users.position[:cars, None], users.yaw[:cars, None], users.size[:cars, None])
     overlaps = find_overlaps(*own, users.position, users.yaw, users.size)
-    return overlaps & users.present & ~jnp.eye(cars, len(users.present), dtype=bool)
+    apart = surrogate_safety.find_other_levels(step.scene, step.after.motion)
+    present = users.present if apart is None else users.present & ~apart
+    return overlaps & present & ~jnp.eye(cars, len(users.present), dtype=bool)
 
 
 def overlap(step: RewardInput) -> Float[Array, " A"]:
@@ -31,6 +33,9 @@ def overlap(step: RewardInput) -> Float[Array, " A"]:
 def off_road(step: RewardInput) -> Float[Array, " A"]:
     """1 while a corner of the car is outside of the nearest road edge's point (Waymax)."""
     corners = compute_corners(step.after.motion.position[:, :2], step.after.motion.yaw, step.after.agents.size)
+    if step.scene.edges.height is not None:
+        height = jnp.broadcast_to(step.after.motion.position[:, None, 2], corners.shape[:2])
+        corners = append_height(corners, height)
     distance = compute_signed_distance(corners, list_edge_points(step.scene.edges))
     return jnp.any(distance > 0, axis=1).astype(jnp.float32)
 

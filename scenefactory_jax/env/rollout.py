@@ -101,6 +101,7 @@ class StepRecord:
     joints: Float[Array, "A 17"] | None  # chassis and wheels in MuJoCo's order; None: the dynamics has no joints
     traffic: Boxes
     film_mm: Float[Array, ""]  # of water on the open road
+    height: Float[Array, " A"] | None = None  # of the cars' centres; None: not recorded
 
 
 @pytree_dataclass
@@ -161,4 +162,5 @@ def make_step_record(env: Env, scene: Scene, before: State, after: State, result
         joints=joints,
         traffic=env.current_scene(scene, after).traffic,
         film_mm=after.weather.film_mm,
+        height=motion.position[:, 2],
     )

@@ -88,12 +88,19 @@ def compare_pairs(
 
 def separate_levels(pairs: Pairs, scene: Scene, motion: Motion) -> Pairs:
     """Takes pairs on different levels of the road for infinitely far apart; scenes of one level stay as they are."""
-    if scene.edges.height is None:
+    apart = find_other_levels(scene, motion)
+    if apart is None:
         return pairs
-    height = motion.position[:, 2]
-    apart = jnp.abs(height[:, None] - jnp.concatenate([height, scene.traffic.elevation])) >= LEVEL_M
     ttc, clearance, ahead = (jnp.where(apart, jnp.inf, measure) for measure in (pairs.ttc, pairs.clearance, pairs.ahead))
     return Pairs(ttc, jnp.where(apart, 0.0, pairs.drac), clearance, ahead)
+
+
+def find_other_levels(scene: Scene, motion: Motion) -> Bool[Array, "A B"] | None:
+    """Mask of the road users that are on another level than each car; None in a scene of one level."""
+    if scene.edges.height is None:
+        return None
+    height = motion.position[:, 2]
+    return jnp.abs(height[:, None] - jnp.concatenate([height, scene.traffic.elevation])) >= LEVEL_M
 
 
 def minimum_over_pairs(values: Float[Array, "A B"], present: Bool[Array, " B"]) -> Float[Array, " A"]:

@@ -279,6 +279,7 @@ def trajectory(recording: Recording, index: int, *, steps: int | None = None) ->
     weather = jax.tree.map(lambda leaf: leaf[index], recording.weather)
     state = jax.tree.map(lambda leaf: leaf[index], recording.state)
     agents, traffic = state.agents, frames.traffic
+    own, boxes = (None, None) if frames.height is None else np.split(frames.height, [len(agents.present)], axis=1)
     return Trajectory(
         scene=replace(scene, weather=weather),
         position=frames.position,
@@ -293,7 +294,8 @@ def trajectory(recording: Recording, index: int, *, steps: int | None = None) ->
         control_hz=control_hz,
         title=recording.names[index],
         weather=_format_weather(weather, seconds=end / control_hz),
-        traffic=TrafficBoxes(traffic.position, traffic.yaw, traffic.size, traffic.present),
+        traffic=TrafficBoxes(traffic.position, traffic.yaw, traffic.size, traffic.present, boxes),
+        height=own,
         start_s=1.0 / control_hz,  # the first state is that after a control step
     )
 

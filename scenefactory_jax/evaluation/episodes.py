@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from scenefactory_jax.core.pytree import pytree_dataclass
-from scenefactory_jax.core.types import Env, Events, State
+from scenefactory_jax.core.types import Boxes, Env, Events, Motion, Scene, State
 from scenefactory_jax.env import termination
 from scenefactory_jax.env.rollout import ControlStep, Hook
 from scenefactory_jax.evaluation import route_signals
@@ -59,6 +59,7 @@ class EpisodeFrame:
     goal: Float[Array, "A 2"]
     events: Events
     traffic: TrafficFrame
+    height: Float[Array, " U"] | None = None  # of the agents, then of the traffic; None: the scene has one level
 
 
 def make_metrics(state: State) -> EpisodeMetrics:
@@ -104,10 +105,16 @@ def make_hook(
             goal=state.agents.goal,
             events=result.events,
             traffic=traffic,
+            height=find_heights(step.scene, state.motion, boxes),
         )
         return _update(metrics, step, signals, route, ttc_limit_s=ttc_limit_s), frame
 
     return hook
+
+
+def find_heights(scene: Scene, motion: Motion, boxes: Boxes) -> Float[Array, " U"] | None:
+    """Heights of agents and traffic; None in a scene of one level."""
+    return None if scene.edges.height is None else jnp.concatenate([motion.position[:, 2], boxes.elevation])
 
 
 def _update(

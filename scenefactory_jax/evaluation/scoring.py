@@ -20,7 +20,7 @@ from scenefactory_jax.core.schema import ConfigError
 from scenefactory_jax.core.track_interpolation import interpolate_track
 from scenefactory_jax.core.types import DRIVABLE, ROUTE_SPACING_M, AgentLog, Agents, Boxes, Motion, Scene, TrafficLog
 from scenefactory_jax.env.step_metrics import StepMetricsConfig
-from scenefactory_jax.evaluation.episodes import EpisodeFrame
+from scenefactory_jax.evaluation.episodes import EpisodeFrame, find_heights
 from scenefactory_jax.evaluation.metrics import episode_metrics, episode_scores
 from scenefactory_jax.evaluation.metrics.episode_record import EpisodeRecord, Lanes, Lights, Others, Track, leave_out
 from scenefactory_jax.evaluation.metrics.episode_steps import StepMetrics, measure_steps
@@ -28,7 +28,7 @@ from scenefactory_jax.evaluation.metrics.step_failures import find_failures
 from scenefactory_jax.evaluation.metrics.waymax_steps import Paths
 from scenefactory_jax.evaluation.settings import ScoreSettings
 from scenefactory_jax.roadgraph.lane_crossings import find_intersection_segments
-from scenefactory_jax.roadgraph.signed_edge_distance import list_edge_points
+from scenefactory_jax.roadgraph.signed_edge_distance import append_height, list_edge_points, list_first_points
 from scenefactory_jax.roadgraph.traffic_lights import read_light_states
 
 STEP_S = 0.1  # between states
@@ -163,7 +163,7 @@ def score_world(
 
     def score_agent(agent: Int[Array, ""]) -> tuple[dict[str, Array], dict[str, Array]]:
         record = EpisodeRecord(
-            ego=Track(*(leaf[agent] for leaf in users[:4])),
+            ego=read_track(users, agent),
             size=users.size[agent],
             counted=counted & users.valid[agent],
             others=leave_out(users, agent),
@@ -217,7 +217,16 @@ def collect_users(scene: Scene, start: Start, frames: EpisodeFrame, *, past_rows
     kind = scene.traffic_log.kind if follows_log else jnp.zeros(len(boxes.yaw), jnp.int32)
     columns = [jnp.concatenate(pair) for pair in zip(own, other, strict=True)]
     size, kinds = jnp.concatenate([start.agents.size, boxes.size]), jnp.concatenate([jnp.zeros(len(motion.yaw), jnp.int32), kind])
-    return Others(columns[0], columns[1], columns[2], columns[3], size, kinds)
+    height = find_heights(scene, motion, boxes)
+    if height is not None and frames.height is not None:  # before the start, that of the start
+        height = jnp.concatenate([jnp.repeat(height[:, None], past_rows + 1, axis=1), frames.height.T], axis=1)
+    return Others(columns[0], columns[1], columns[2], columns[3], size, kinds, height)
+
+
+def read_track(users: Others, row: Int[Array, ""]) -> Track:
+    """The states of one road user, with its heights on roads of several levels."""
+    position, yaw, velocity, valid = (leaf[row] for leaf in users[:4])
+    return Track(append_height(position, None if users.height is None else users.height[row]), yaw, velocity, valid)
 
 
 def _read_past(scene: Scene, log: AgentLog | TrafficLog | None, rows: int, count: int = 0) -> tuple[Array, ...]:
@@ -252,7 +261,7 @@ def list_lane_points(scene: Scene, facts: LaneFacts) -> Lanes:
     """Lists the first points of the segments of driving lanes."""
     lanes = scene.lanes
     return Lanes(
-        position=lanes.midpoint - lanes.half_length[:, None] * lanes.direction,
+        position=list_first_points(lanes),
         direction=lanes.direction,
         lane=lanes.polyline,
         kind=lanes.kind,

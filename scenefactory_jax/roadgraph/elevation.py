@@ -6,7 +6,8 @@ chapter IX): with the nearest node (i, j) and the offset (s, t) from it in cells
     h = sum_{k, l in -1..1} w_k(t) w_l(s) c[j + k, i + l]       w(t) = ((1/2 - t)^2 / 2, 3/4 - t^2, (1/2 + t)^2 / 2)
 
 Height and slope are continuous, and a plane is exact. Beyond the grid the height goes on along its tangent. Where roads cross on several
-levels, there is one height a level; everywhere else the levels are equal.
+levels, there is one height a level; everywhere else the levels are equal. Between, a level that leaves the road is absent: nothing on
+that road follows it, but what is beside the road may be on it.
 """
 
 from typing import Any, NamedTuple
@@ -49,7 +50,11 @@ def _find_ground(elevation: Elevation, position: Float[Array, "2"], near: Float[
     sums = [(patch * (y[:, None] * x)).sum((1, 2)) for y, x in ((along_y, along_x), (along_y, slope_x), (slope_y, along_x))]
     slope = jnp.stack(sums[1:], axis=-1)  # per cell
     height = sums[0] + dot(slope, offset - inside)
-    level = jnp.argmin(jnp.abs(height - near))
+    apart = jnp.abs(height - near)
+    if elevation.present is not None:
+        there = jax.lax.dynamic_slice(elevation.present, (0, first[1] + 1, first[0] + 1), (levels, 1, 1))[:, 0, 0]
+        apart = jnp.where(there, apart, apart + LEVEL_M)  # a car beside a ramp is not lifted onto it
+    level = jnp.argmin(apart)
     return Ground(height[level], slope[level] / elevation.cell_m)
 
 
@@ -64,6 +69,13 @@ def compute_grade(ground: Ground, yaw: Float[Array, "*n"]) -> tuple[Float[Array,
     rise = dot(ground.slope, heading_vector(yaw))
     cosine = 1.0 / jnp.sqrt(1.0 + rise**2)
     return rise * cosine, cosine
+
+
+def read_grade(scene: Scene, motion: Motion) -> Float[Array, " A"] | None:
+    """Computes the rise over run under cars along their headings; None if the road is flat."""
+    if scene.elevation is None:
+        return None
+    return dot(find_ground(scene.elevation, motion.position[:, :2], motion.position[:, 2]).slope, heading_vector(motion.yaw))
 
 
 def find_start_ground(scene: Scene) -> Ground | None:

@@ -19,8 +19,19 @@ class EdgePoints(NamedTuple):
 
 
 def list_edge_points(edges: Road) -> EdgePoints:
-    """Lists the first points of road-edge segments."""
-    return EdgePoints(edges.midpoint - edges.half_length[:, None] * edges.direction, edges.direction, edges.polyline, edges.valid)
+    """Lists the first points of road-edge segments; on roads of several levels, with the heights of the segments."""
+    return EdgePoints(list_first_points(edges), edges.direction, edges.polyline, edges.valid)
+
+
+def list_first_points(road: Road) -> Float[Array, "P d"]:
+    """Lists the first points of segments; on roads of several levels, d = 3, with the heights of the segments."""
+    first = road.midpoint - road.half_length[:, None] * road.direction
+    return append_height(first, road.height)
+
+
+def append_height(place: Float[Array, "*n 2"], height: Float[Array, "*n"] | None) -> Float[Array, "*n d"]:
+    """Appends heights to places in the plane, if there are any."""
+    return place if height is None else jnp.concatenate([place, height[..., None]], axis=-1)
 
 
 def compute_signed_distance(point: Float[Array, "*n d"], edges: EdgePoints, *, height_scale: float = 1.0) -> Float[Array, "*n"]:
@@ -58,7 +69,7 @@ def compute_line_distance(point: Float[Array, "*n d"], edges: EdgePoints, *, hei
 
 def _find_nearest(point: Float[Array, "*n d"], edges: EdgePoints, *, height_scale: float) -> Int[Array, "*n"]:
     scale = jnp.array([1.0, 1.0, height_scale][: point.shape[-1]], jnp.float32)
-    apart = (point[..., None, :] - edges.position) * scale
+    apart = (point[..., None, :] - edges.position[:, : point.shape[-1]]) * scale
     return jnp.argmin(jnp.where(edges.valid, dot(apart, apart), jnp.inf), axis=-1)
 
 

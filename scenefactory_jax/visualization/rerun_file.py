@@ -18,7 +18,8 @@ from scenefactory_jax.env.rollout import Recording, StepRecord
 from scenefactory_jax.visualization.birds_eye import drawing
 from scenefactory_jax.visualization.mujoco import world_mjcf
 from scenefactory_jax.visualization.recorded_episodes import cut_world
-from scenefactory_jax.visualization.road_lines import LAYERS, join_segments
+from scenefactory_jax.visualization.road_levels import list_levels, measure_level, measure_road
+from scenefactory_jax.visualization.road_lines import LAYERS, STRAIGHT_M, join_segments
 from scenefactory_jax.visualization.web import replay_data
 
 TRAIL_S, TRAIL_HZ = 3.0, 10.0
@@ -115,9 +116,11 @@ class _World:
     def _send_map(self, scene: Scene) -> None:
         lines: dict[str, list[Float[np.ndarray, "n 3"]]] = {}
         colours = {}
-        for points, kind in join_segments(scene.road):
+        flat = scene.elevation is None
+        joined = ((level, *line) for level in list_levels(scene) for line in join_segments(level.road, STRAIGHT_M if flat else None))
+        for level, points, kind in joined:
             layer = next((name for name, kinds in LAYERS.items() if kind in kinds), "other")
-            lines.setdefault(layer, []).append(np.c_[points, np.zeros(len(points))])
+            lines.setdefault(layer, []).append(np.c_[points, measure_level(scene, points, level.number)])
             colours[layer] = [round(255 * channel) for channel in world_mjcf.COLOURS.get(kind, world_mjcf.GREY)[:3]]
         for layer, strips in lines.items():
             self.log(f"map/{layer}", self.rr.LineStrips3D(strips, colors=[colours[layer]]))
@@ -125,25 +128,27 @@ class _World:
     def _send_car(self, car: int, steps: Int[np.ndarray, " n"], size: Float[np.ndarray, "2"], goal_radius_m: float | int) -> None:
         rr, shots, colour = self.rr, self.shots, pack_colour(drawing.colour_of(car))
         place, yaw = np.asarray(shots.position[:, car], float), np.asarray(shots.yaw[steps, car], float)
-        boxes = self._boxes(place[steps], yaw, np.tile(size, (len(steps), 1)), CAR_M, colour)
+        road = measure_road(self.scene, place, np.zeros(len(place)) if shots.height is None else np.asarray(shots.height[:, car], float))
+        boxes = self._boxes(np.c_[place, road][steps], yaw, np.tile(size, (len(steps), 1)), CAR_M, colour)
         self.send_columns(f"car{car}/box", steps, boxes)
         back, stride = round(TRAIL_S * self.hz), max(round(self.hz / TRAIL_HZ), 1)
         driven = [steps[(steps >= step - back) & (steps <= step)][::-1][::stride] for step in steps]
-        strips = [np.c_[place[rows], np.full(len(rows), 0.05)] for rows in driven]
+        strips = [np.c_[place[rows], road[rows] + 0.05] for rows in driven]
         self.send_columns(f"car{car}/trail", steps, rr.LineStrips3D.columns(strips=strips, colors=np.full(len(steps), colour)))
         goal = np.asarray(shots.goal[steps, car], float)
         begins = np.flatnonzero(np.r_[True, (goal[1:] != goal[:-1]).any(axis=1)])
         ring = goal_radius_m * np.c_[np.cos(CIRCLE), np.sin(CIRCLE), 0 * CIRCLE]
-        rings = [ring + np.r_[goal[row], 0.05] for row in begins]
+        heights = measure_road(self.scene, goal, road[steps]) + 0.05
+        rings = [ring + np.r_[goal[row], heights[row]] for row in begins]
         self.send_columns(f"car{car}/goal", steps[begins], rr.LineStrips3D.columns(strips=rings, colors=np.full(len(rings), colour)))
         if (gone := _find_ends(steps, len(self.time))).size:
             self.send_columns(f"car{car}", gone, rr.Clear.columns(is_recursive=[True] * len(gone)))
 
-    def _boxes(self, centre: np.ndarray, yaw: np.ndarray, size: np.ndarray, height_m: float, colour: np.uint32) -> Any:
+    def _boxes(self, base: np.ndarray, yaw: np.ndarray, size: np.ndarray, height_m: float, colour: np.uint32) -> Any:
         zero = np.zeros(len(yaw))
         return self.rr.Boxes3D.columns(
             half_sizes=np.c_[size / 2, zero + height_m / 2],
-            centers=np.c_[centre, zero + height_m / 2],
+            centers=base + np.array([0.0, 0.0, height_m / 2]),
             quaternions=np.c_[zero, zero, np.sin(yaw / 2), np.cos(yaw / 2)],
             colors=np.full(len(yaw), colour),
         )
@@ -167,7 +172,8 @@ class _World:
         if not traffic.present.any():
             return
         position, yaw, size = (np.asarray(column, float)[traffic.present] for column in traffic[:3])
-        columns = self._boxes(position, yaw, size, TRAFFIC_M, pack_colour(GREY))
+        road = measure_road(self.scene, traffic.position, np.asarray(traffic.elevation))[traffic.present]
+        columns = self._boxes(np.c_[position, road], yaw, size, TRAFFIC_M, pack_colour(GREY))
         self.send_columns("traffic", np.arange(len(traffic.present)), columns.partition(traffic.present.sum(axis=1)))
 
 

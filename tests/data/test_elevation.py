@@ -14,7 +14,7 @@ from scenefactory_jax.core.raw_scene import Polyline, RawScene, Track, Unpackabl
 from scenefactory_jax.core.types import DRIVABLE, Boxes, State
 from scenefactory_jax.data.formats import reader_selection
 from scenefactory_jax.data.loading import scene_source
-from scenefactory_jax.data.packing import elevation_grid, route_conflicts
+from scenefactory_jax.data.packing import elevation_grid, route_columns, route_conflicts
 from scenefactory_jax.data.packing.stack import stack
 from scenefactory_jax.dynamics import bicycle
 from scenefactory_jax.dynamics.articulated.parameters import GRAVITY
@@ -87,6 +87,8 @@ def test_levels_are_told_apart_by_height_and_by_the_lanes_direction(crossing):
     for road in crossing.roads:
         points = jnp.asarray(road.xyz - [-1.0, 2.0, 0.0], jnp.float32)  # around the first car
         np.testing.assert_allclose(FIND(scene.elevation, points[:, :2], points[:, 2]).height, points[:, 2], atol=0.05)
+    beside = jnp.tile(jnp.array([9.0, -15.0]), (len(LINE), 1))  # of the ramp, 4 m below it
+    assert np.abs(FIND(scene.elevation, beside, jnp.zeros(len(LINE))).height).max() < 2.0, "a car there is not lifted onto the ramp"
 
     @jax.jit
     def look(scene):
@@ -104,6 +106,21 @@ def test_levels_are_told_apart_by_height_and_by_the_lanes_direction(crossing):
     assert edges[1, near & ~along].all() and not edges[1, near & along].any()
 
 
+def test_who_follows_a_road_stays_on_it(crossing):
+    """A wheel that sinks 2 cm into the road, and whose height chooses the level, over each lane in both directions."""
+    config = load_config("train", "scenes=womd", "scenes/pack/elevation=hills", "scenes.pack.elevation.levels=2")["scenes"]
+    numbers = elevation_grid.ElevationConfig(**config["pack"]["elevation"])
+    fit = to_jax(elevation_grid.fit_elevation(crossing, np.zeros(3), 100.0, numbers))
+    lanes = np.stack([way for line in crossing.roads if line.kind in DRIVABLE for way in (line.xyz, line.xyz[::-1])]).astype(np.float32)
+
+    def roll(height, place):
+        found = elevation.find_ground(fit, place, height - 0.02).height
+        return found, found
+
+    heights = jax.jit(jax.vmap(lambda lane: jax.lax.scan(roll, lane[0, 2], lane[:, :2])[1]))(lanes)
+    np.testing.assert_allclose(heights, lanes[..., 2], atol=0.05)
+
+
 def test_routes_on_two_levels_do_not_meet():
     """A route along x and one along y over it, or on the same ground."""
     way = np.arange(-20.0, 21.0)
@@ -114,7 +131,8 @@ def test_routes_on_two_levels_do_not_meet():
         "road.midpoint": lines.reshape(-1, 2), "road.polyline": np.repeat([7, 8], 41),
     }  # fmt: skip
     for height, meet in ((BRIDGE_M, False), (0.0, True)):
-        zones = route_conflicts.find_zones(leaves | {"road.height": np.repeat([0.0, height], 41)})
+        heights = leaves | {"road.height": np.repeat([0.0, height], 41)}
+        zones = route_conflicts.find_zones(heights | route_columns.find_heights(heights))
         assert np.isfinite(zones["traffic_log.zone_enter"]).any() == meet
 
 

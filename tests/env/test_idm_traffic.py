@@ -128,7 +128,7 @@ def run(scene, beside=None, **how):
 
 
 def count_collisions(boxes) -> int:
-    over = jax.vmap(lambda one: corridor.find_overlaps(one, one))(boxes)
+    over = jax.vmap(lambda one: corridor.find_overlaps(one, one, leveled=False))(boxes)
     return int(np.sum(np.asarray(over) & ~np.eye(SLOTS, dtype=bool)))
 
 

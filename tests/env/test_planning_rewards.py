@@ -1,6 +1,5 @@
 """Reward terms of V-Max and MetaDrive, by hand, on steps of two cars of 4 x 2 m on a street with a route along x."""
 
-import dataclasses
 import functools
 
 import jax
@@ -81,7 +80,7 @@ def test_off_route_reads_the_distance_and_other_routes():
     assert terms("vmax_navigation", end=(1.0, 2.0))["off_route"] == 0
     assert terms("vmax_navigation", end=(1.0, 2.1))["off_route"] == pytest.approx(-0.6)
     scene = street(starts=((0.0, 0.0), (40.0, 3.0)))
-    two = {field.name: jnp.concatenate([getattr(scene.routes, field.name)] * 2) for field in dataclasses.fields(scene.routes)}
+    two = vars(jax.tree.map(lambda leaf: jnp.concatenate([leaf, leaf]), scene.routes))
     two |= {"position": two["position"].at[1, :, 1].set(2.0), "on_route": jnp.array([True, False])}
     scene = replace(scene, routes=replace(scene.routes, **two))
     assert terms("vmax_navigation", end=(1.0, 1.5), scene=scene)["off_route"] == 0  # 1.5 m from its own, 0.5 m from the other

@@ -11,7 +11,7 @@ from scenefactory_jax.core.pytree import replace
 from scenefactory_jax.core.schema import ConfigError
 from scenefactory_jax.core.types import LIGHT_STATES
 from scenefactory_jax.env.environment import make_env
-from scenefactory_jax.evaluation.planners import route_tracking
+from scenefactory_jax.evaluation.planners import route_tracking, tracker
 from scenefactory_jax.evaluation.planners.tracker import Tracker
 from scenefactory_jax.learning.training_loop import make_policy
 
@@ -144,3 +144,18 @@ def test_target_speeds_keep_to_a_limit_of_the_acceleration():
         bound = 2.0 if limit is None else min(2.0, float(limit[0]))  # lateral_mps2 and braking_mps2
         found = jax.jit(lambda most: route_tracking.compute_target_speed(route, route.limit, tracker, most))(limit)
         assert float(found[0]) == pytest.approx(np.sqrt(bound * radius + 2 * bound * straight_m), rel=1e-3)
+
+
+def test_gravity_along_the_road_is_added_to_the_action():
+    """Uphill the throttle, downhill the brake has the weight along the road, too; a car that is to stand has its brakes on."""
+    cars = {name: Tracker(**numbers) for name, numbers in load_config("train", "policy=idm_route")["policy"]["trackers"].items()}
+    car, grade = cars["articulated_car"], np.array([0.0, 0.1, -0.1, -0.1])
+    weight = 9.81 * grade / np.hypot(1.0, grade)
+    ask = (jnp.array([0.5, 0.5, 0.5, 0.0]), jnp.zeros(4), jnp.array([5.0, 5.0, 5.0, 0.0]))
+    action = tracker.make_action(*ask, car, grade=jnp.asarray(grade))
+    push = np.array([0.5, 0.5, 0.5]) + car.rolling_mps2 + 25.0 * car.air_drag_radpm + weight[:3]
+    expected = np.where(push > 0, push / car.throttle_mps2, push / car.brake_mps2)
+    np.testing.assert_allclose(action[:3, 0], expected, rtol=1e-4)
+    assert -action[3, 0] * car.brake_mps2 > 1.5 * abs(weight[3])
+    flat = [tracker.make_action(*ask, cars["bicycle_waymax"], **there) for there in ({}, {"grade": jnp.asarray(grade)})]
+    np.testing.assert_array_equal(*flat)  # it has no weight

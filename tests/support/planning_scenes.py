@@ -42,7 +42,7 @@ def street(*, starts=((0.0, 0.0), (10.0, 0.0)), yaws=(0.0, 0.0), routes=True, li
             "stop_arc": line([20.0]),
             "stop_control": line([0]),
         }
-        missing = {f.name: line(False) for f in dataclasses.fields(table) if f.name not in fields}
+        missing = {f.name: line(False) for f in dataclasses.fields(table) if f.name not in fields and f.default is dataclasses.MISSING}
         agents = replace(scene.agents, route_end=column_of(100.0 * (np.arange(count) == 0)))
         scene = replace(scene, routes=Routes(**fields, **missing), agents=agents)
     if lights:

@@ -68,7 +68,7 @@ def arrays(directory: dict, text: str) -> dict[str, np.ndarray]:
 def test_the_page_reads_what_there_is(page):
     """Every key that a script reads of a world is one that is written, or one that `data.js` derives; events have their own names."""
     scripts = "\n".join(path.read_text() for path in (ROOT / "scenefactory_jax" / "visualization" / "web" / "page").glob("*.js"))
-    derived = {"array", "bySlot", "end", "road"}
+    derived = {"array", "bridge", "bySlot", "end", "road"}
     assert set(re.findall(r"\bworld\.(\w+)", scripts)) <= set(unpacked(page)[0]) | derived
     glyphs = re.search(r"const GLYPHS = \{(.+?)\n\};", scripts, re.DOTALL).group(1)
     named = set(re.findall(r"^  (\w+):", glyphs, re.MULTILINE)) | set(re.findall(r'name === "(\w+_\w+)"', scripts))

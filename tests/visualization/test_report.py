@@ -19,7 +19,7 @@ from scenefactory_jax.evaluation import statistics
 from scenefactory_jax.evaluation.metrics import agent_metrics
 from scenefactory_jax.evaluation.records import RecordsError, read_records, select_rows, write_records
 from scenefactory_jax.visualization import video_file
-from scenefactory_jax.visualization.birds_eye import drawing, patch_overlay, video
+from scenefactory_jax.visualization.birds_eye import drawing, patch_overlay, road_picture, video
 from scenefactory_jax.visualization.birds_eye import figures as birds_eye_figures
 from scenefactory_jax.visualization.birds_eye import traffic_shapes as shapes
 from scenefactory_jax.visualization.report import evaluation_report, plots, tables
@@ -299,7 +299,8 @@ def test_car_shape_is_the_oriented_box(yaw):
 
 def test_dashes_run_on_across_segments():
     """3 m on, 6 m off, counted along the polyline and not from each 1 m segment's start."""
-    stroke = drawing.strokes(road_of([(6, np.stack([np.arange(-10.0, 27.0), np.zeros(37)], 1))]))[0]
+    road = road_of([(6, np.stack([np.arange(-10.0, 27.0), np.zeros(37)], 1))])
+    stroke = drawing.strokes(replace(scene_of([[0.0, 0.0]], [[20.0, 0.0]]), road=road))[0]
     along = (np.arange(3600) + 0.5) / 100
     covered = ((stroke.lines[:, :1, 0] + 10 <= along) & (along <= stroke.lines[:, 1:, 0] + 10)).any(axis=0)
     np.testing.assert_array_equal(covered, along % 9 < 3)
@@ -487,9 +488,9 @@ def test_patches_are_drawn_where_they_lie_under_the_lines(trajectory):
     )
     assert patch_overlay.colour_area("AC", 0.8)[0][0] < patch_overlay.colour_area("AC", 0.1)[0][0], "deeper water is bluer"
     view = drawing.View(-60.0, -40.0, 100.0, 500)
-    lines = drawing.strokes(shown.road)
-    with_them = np.array(video.road_image(lines, view, patches=patch_overlay.areas(shown.weather)))
-    without = np.array(video.road_image(lines, view))
+    lines = drawing.strokes(shown)
+    with_them = np.array(road_picture.road_image(lines, view, patches=patch_overlay.areas(shown.weather)))
+    without = np.array(road_picture.road_image(lines, view))
     at = lambda image, x, y: image[tuple(drawing.to_pixels(view, np.array([x, y])).astype(int)[::-1])]  # noqa: E731
     places = ((-20.0, 1.0), (-37.0, -2.0), (5.0, 21.0))
     for (x, y), area in zip(places, patch_overlay.areas(shown.weather), strict=True):

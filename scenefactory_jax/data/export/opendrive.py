@@ -137,6 +137,9 @@ def _make_road(lanes: list[Polyline]) -> Road:
 def _write_road(number: int, road: Road, joints: Joints, width: float, extras: tuple[str, str], find_mark: Any) -> str:
     signals, crosswalks = extras
     height = _write_profile("elevation", "s", road.s, road.lanes[0].xyz[:, 2])
+    bank = _measure_bank(road)
+    slope = 1.0 / np.cos(bank)  # lengths across the road are along its slope
+    lateral = f"<lateralProfile>{_write_profile('superelevation', 's', road.s, bank)}</lateralProfile>" if bank.any() else ""
     borders = [np.full(len(road.s), width / 2)]
     for offset in road.offsets:
         borders.append(2 * offset - borders[-1])
@@ -145,7 +148,7 @@ def _write_road(number: int, road: Road, joints: Joints, width: float, extras: t
     kind, town = KINDS.get(road.kind, "driving"), "motorway" if road.kind == LANE_FREEWAY else "town"
     lanes = "".join(
         f'<lane id="{-1 - index}" type="{kind}"><link>{joints.write_lane_links(number, -1 - index)}</link>'
-        f"{_write_profile('width', 'sOffset', road.s, borders[index] - borders[index + 1])}"
+        f"{_write_profile('width', 'sOffset', road.s, slope * (borders[index] - borders[index + 1]))}"
         f"{_write_mark(find_mark(edge(borders[index + 1])), _find_changes(road, index))}"
         + ("" if lane.speed_limit is None else f'<speed sOffset="0" max="{lane.speed_limit:.9g}" unit="m/s"/>')
         + "</lane>"
@@ -155,10 +158,22 @@ def _write_road(number: int, road: Road, joints: Joints, width: float, extras: t
     return (
         f'<road name="" id="{number}" length="{road.length:.9g}" junction="{joints.junction(number)}" rule="RHT">'
         f'<link>{joints.write_road_links(number)}</link><type s="0" type="{town}"/><planView>{road.plan}</planView>'
-        f"<elevationProfile>{height}</elevationProfile><lanes>{_write_profile('laneOffset', 's', road.s, borders[0])}"
+        f"<elevationProfile>{height}</elevationProfile>{lateral}<lanes>{_write_profile('laneOffset', 's', road.s, slope * borders[0])}"
         f'<laneSection s="0"><center><lane id="0" type="none">{middle}</lane></center>'
         f"<right>{lanes}</right></laneSection></lanes>{crosswalks}{signals}</road>"
     )
+
+
+def _measure_bank(road: Road) -> Float[np.ndarray, " S"]:
+    """The angle of the cross-section along a road, rad: the plane through its reference line that is nearest to its lanes."""
+    across, along, sums = np.stack(road.offsets[1:] or [np.zeros(len(road.s))]), road.lanes[0].xyz, np.zeros((2, len(road.s)))
+    for offset, lane in zip(across, road.lanes[1:], strict=False):
+        shape = shapely.LineString(lane.xyz[:, :2])
+        way = shapely.line_locate_point(shape, shapely.points(along[:, :2]))
+        arc = np.append(0.0, np.cumsum(np.linalg.norm(np.diff(lane.xyz[:, :2], axis=0), axis=1)))
+        rise = np.interp(way, arc, lane.xyz[:, 2]) - along[:, 2]
+        sums += offset * rise, offset**2
+    return np.arctan(sums[0] / np.maximum(sums[1], 1e-9))
 
 
 def _measure_widths(roads: Sequence[Road], joints: Joints, edges: Sequence[Polyline]) -> list[float]:

@@ -189,7 +189,8 @@ def _routes(
     if config is None:
         return route_columns.make_no_routes(slots, len(traffic)) | route_conflicts.make_no_zones(len(traffic)), None
     found, counts = route_columns.pack_routes(raw, logs, *place, slots=slots, traffic=traffic, config=config, **who)
-    return found | route_conflicts.find_zones(road | found | {"traffic_log.size": size}), counts
+    found |= route_columns.find_heights(road | found)
+    return found | route_conflicts.find_zones(found | {"traffic_log.size": size}), counts
 
 
 def _find_centre(raw: RawScene, centre: str) -> tuple[Float[np.ndarray, "3"], str]:

@@ -7,6 +7,7 @@ from typing import Annotated, Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Int
+from scipy.spatial import KDTree
 
 from scenefactory_jax.core.instantiate import instantiate
 from scenefactory_jax.core.raw_scene import RawScene
@@ -16,6 +17,7 @@ from scenefactory_jax.core.types import DRIVABLE, ROUTE_SPACING_M
 from scenefactory_jax.roadgraph import lane_graph, route_sets
 from scenefactory_jax.roadgraph.route_sets import LaneMap, SampledRoute
 
+FAR_M = 1e4  # larger than any scene
 BEHIND_M = 10.0  # a stop place lies at most so far before the lane that its control governs
 
 
@@ -112,6 +114,18 @@ def pack_routes(
     along = sum(route.along_lanes for route in found[:logged])
     rebuilt = any(line.rebuilt for line in linked.roads)
     return columns, RouteCounts(along, logged - along, len(found) - logged, rebuilt)
+
+
+def find_heights(leaves: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """Heights of routes' points on roads of several levels: of the nearest segment of their lane, beside lanes of the nearest of any."""
+    if "road.height" not in leaves:
+        return {}
+    place, line, lane = leaves["road.midpoint"], leaves["road.polyline"], leaves["routes.lane"]
+    points = leaves["routes.position"].reshape(-1, 2)
+    beside = (lane < 0).ravel()
+    own = KDTree(np.column_stack([place, FAR_M * line])).query(np.column_stack([points, FAR_M * lane.ravel()]))[1]
+    nearest = np.where(beside, KDTree(place).query(points)[1], own)
+    return {"routes.height": leaves["road.height"][nearest].reshape(lane.shape)}
 
 
 def _is_moving(raw: RawScene, logs: Logs, index: int, min_travel_m: float) -> bool:

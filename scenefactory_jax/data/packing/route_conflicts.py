@@ -39,7 +39,7 @@ class Line(NamedTuple):
 
 
 def find_zones(leaves: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """Computes `zone_enter`, `zone_leave` and `zone_match` of a scene's traffic from its columns; with `road.height`, level by level."""
+    """Computes `zone_enter`, `zone_leave` and `zone_match` of a scene's traffic from its columns; with `routes.height`, level by level."""
     has_route, size = leaves["traffic_log.has_route"], leaves["traffic_log.size"]
     lines = {int(row): _read_line(leaves, int(row)) for row in np.flatnonzero(has_route)}
     found = {f"traffic_log.{name}": np.full((len(has_route), len(has_route), ZONES), np.inf) for name in NAMES}
@@ -99,21 +99,11 @@ def _read_line(leaves: Mapping[str, np.ndarray], row: int) -> Line:
     route = int(leaves["traffic_log.route"][row])
     points = leaves["routes.position"][route, : int(np.ceil(leaves["routes.length"][route] / ROUTE_SPACING_M)) + 1]
     box = (points.min(axis=0), points.max(axis=0)) if len(points) else (np.full(2, np.inf), np.full(2, -np.inf))
-    height = _find_heights(leaves, points, route)
+    height = leaves["routes.height"][route, : len(points)] if "routes.height" in leaves else np.zeros(len(points))
     if len(points) < 2:  # no direction, no zones
         return Line(points, points, height, *box)
     along = np.gradient(points, axis=0)
     return Line(points, along / np.maximum(np.linalg.norm(along, axis=1, keepdims=True), 1e-9), height, *box)
-
-
-def _find_heights(leaves: Mapping[str, np.ndarray], points: Float[np.ndarray, "N 2"], route: int) -> Float[np.ndarray, " N"]:
-    """Heights of a route's points: of the nearest segment of their lane, for points beside lanes of the nearest segment of any."""
-    if "road.height" not in leaves:
-        return np.zeros(len(points))
-    place, line, lane = leaves["road.midpoint"], leaves["road.polyline"], leaves["routes.lane"][route, : len(points)]
-    apart = (lane[:, None] >= 0) & (lane[:, None] != line)
-    squared = np.square(points[:, None] - place).sum(axis=2)
-    return leaves["road.height"][np.argmin(np.where(apart, np.inf, squared), axis=1)]
 
 
 def _find_part(line: Line, other: Line, reach_m: float) -> tuple[int, int]:

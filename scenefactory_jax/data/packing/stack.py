@@ -175,6 +175,6 @@ def _pad(name: str, leaves: Sequence[np.ndarray], sizes: Mapping[str, int]) -> n
         stacked[(world, *map(slice, leaf.shape))] = leaf
         if name == "agents.size":
             stacked[world, len(leaf) :] = leaf[-1] if len(leaf) else 1.0
-        elif name == "routes.position" and leaf.shape[1]:  # the points behind a route's end repeat it
+        elif name in ("routes.position", "routes.height") and leaf.shape[1]:  # the points behind a route's end repeat it
             stacked[world, : len(leaf), leaf.shape[1] :] = leaf[:, -1:]
     return stacked

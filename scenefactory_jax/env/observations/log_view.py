@@ -11,6 +11,7 @@ from scenefactory_jax.core.schema import Positive
 from scenefactory_jax.core.track_interpolation import SNAP, find_bracketing_rows, interpolate_track
 from scenefactory_jax.core.types import Scene, State
 from scenefactory_jax.env.traffic.log_playback import Row
+from scenefactory_jax.roadgraph.elevation import read_grade
 
 
 class LoggedState(NamedTuple):
@@ -28,6 +29,7 @@ class LogView(NamedTuple):
     now: LoggedState
     next: LoggedState
     valid: Bool[Array, "*n"]  # the agent is within its log, from now to the next action
+    grade: Float[Array, "*n"] | None = None  # rise over run under the agent along its heading; None: the road is flat
 
 
 def log(scene: Scene, state: State, *, start_row: Row, action_s: Positive, control_dt: float) -> LogView:
@@ -40,7 +42,8 @@ def log(scene: Scene, state: State, *, start_row: Row, action_s: Positive, contr
     motion, row = state.motion, start_row + state.steps_since_spawn.astype(jnp.float32) * (control_dt / scene.log.dt)
     now, present = _read(scene, state, row)
     following, known = _read(scene, state, row + action_s / scene.log.dt)
-    return LogView(to_frame(motion.velocity[:, :2], motion.yaw), now, following, present & known)
+    velocity = to_frame(motion.velocity[:, :2], motion.yaw)
+    return LogView(velocity, now, following, present & known, read_grade(scene, motion))
 
 
 def _read(scene: Scene, state: State, row: Float[Array, " A"]) -> tuple[LoggedState, Bool[Array, " A"]]:

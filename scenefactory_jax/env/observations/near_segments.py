@@ -17,6 +17,7 @@ class NearSegments(NamedTuple):
     direction: Float[Array, "*n E 2"]  # unit
     half_length: Float[Array, "*n E"]
     present: Bool[Array, "*n E"]
+    height: Float[Array, "*n E"] | None = None  # None: the scene has one level
 
 
 def gather_nearest(road: Road, position: Float[Array, "A 2"], yaw: Float[Array, " A"], *, count: int, range_m: float) -> NearSegments:
@@ -30,4 +31,5 @@ def gather_nearest(road: Road, position: Float[Array, "A 2"], yaw: Float[Array, 
     index, mask = nearest_rows.gather_chunks(chunks, position, near, count=-(-count // nearest_rows.CHUNK), rows=rows)
     turn = lambda vectors: to_frame(vectors, yaw[:, None])  # noqa: E731
     middle = turn(road.midpoint[index] - position[:, None])
-    return NearSegments(middle, turn(road.direction[index]), road.half_length[index], mask & road.valid[index])
+    height = None if road.height is None else road.height[index]
+    return NearSegments(middle, turn(road.direction[index]), road.half_length[index], mask & road.valid[index], height)

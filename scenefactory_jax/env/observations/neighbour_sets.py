@@ -89,6 +89,7 @@ def _find_nearest(
     order = jnp.argsort(squared, axis=1)[:, : min(count, len(users.present))]
     centres, radius = cover_with_circles(users.position, users.yaw, users.size, **circles)
     pairs = surrogate_safety.compare_pairs(centres, radius, users.velocity, motion.yaw, drac_gap_floor_m=1.0)
+    pairs = surrogate_safety.separate_levels(pairs, scene, motion)
     mask, pairs = jax.tree.map(lambda leaf: jnp.take_along_axis(leaf, order, axis=1), (others, pairs))
     return motion, users, order, mask, pairs
 

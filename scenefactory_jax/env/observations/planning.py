@@ -8,11 +8,11 @@ from jaxtyping import Array, Bool, Float, Int
 
 from scenefactory_jax.core.geometry import dot, to_frame, wrap_angle
 from scenefactory_jax.core.schema import Count, NonNegative, Positive
-from scenefactory_jax.core.types import ROAD_USERS, YELLOW_STATES, Scene, State
+from scenefactory_jax.core.types import ROAD_USERS, YELLOW_STATES, Motion, Scene, State
 from scenefactory_jax.env import route_following, surrogate_safety
 from scenefactory_jax.env.observations.near_segments import NearSegments, gather_nearest
 from scenefactory_jax.env.observations.state_vectors import friction_ahead
-from scenefactory_jax.roadgraph import nearest_rows
+from scenefactory_jax.roadgraph import elevation, nearest_rows
 
 SPACING_M = 1.0  # between the points of the centre line
 
@@ -26,6 +26,7 @@ class CentreLine(NamedTuple):
     limit: Float[Array, "*n P"]  # m/s; 0 where none is known
     known: Bool[Array, "*n"]  # the agent has a route
     remaining: Float[Array, "*n"]  # to the goal along the route
+    height: Float[Array, "*n P"] | None = None  # of the road; None: the scene has one level
 
 
 class StopLinesAhead(NamedTuple):
@@ -46,6 +47,8 @@ class NearUsers(NamedTuple):
     size: Float[Array, "*n K 2"]  # length, width
     kind: Int[Array, "*n K"]  # index into ROAD_USERS
     present: Bool[Array, "*n K"]
+    height: Float[Array, "*n K"] | None = None  # None: the scene has one level
+    climb: Float[Array, "*n K"] | None = None  # m/s
 
 
 class PlanningView(NamedTuple):
@@ -61,6 +64,7 @@ class PlanningView(NamedTuple):
     edges: NearSegments
     lanes: NearSegments
     mu: Float[Array, "*n"]  # smallest friction coefficient here and ahead on the route; inf where it is not observed
+    grade: Float[Array, "*n"] | None = None  # rise over run under the agent along its heading; None: the road is flat
 
 
 def planning(
@@ -91,18 +95,31 @@ def planning(
     mu = jnp.full_like(motion.yaw, jnp.inf)
     if friction_ahead_m is not None and friction is not None:
         mu = jnp.min(friction_ahead(scene, state, ahead_m=friction_ahead_m, friction=friction), axis=1)
+    velocity = to_frame(motion.velocity[:, :2], motion.yaw)
+    line = read_centre_line(scene, state, behind_m=behind_m, ahead_m=ahead_m)
     return PlanningView(
-        velocity=to_frame(motion.velocity[:, :2], motion.yaw),
+        velocity=velocity,
         yaw_rate=motion.yaw_rate,
         steer=motion.steer,
         size=state.agents.size,
-        line=read_centre_line(scene, state, behind_m=behind_m, ahead_m=ahead_m),
+        line=line,
         stops=read_stop_lines(scene, state, state.step.astype(jnp.float32) * control_dt),
         users=find_users(scene, state, count=users),
-        edges=gather_nearest(scene.edges, *place, count=edges, range_m=range_m),
-        lanes=gather_nearest(scene.lanes, *place, count=lanes, range_m=range_m),
+        edges=keep_level(gather_nearest(scene.edges, *place, count=edges, range_m=range_m), line),
+        lanes=keep_level(gather_nearest(scene.lanes, *place, count=lanes, range_m=range_m), line),
         mu=mu,
+        grade=elevation.read_grade(scene, motion),
     )
+
+
+def keep_level(segments: NearSegments, line: CentreLine) -> NearSegments:
+    """Drops the segments on another level than the nearest point of the centre line."""
+    if segments.height is None or line.height is None:
+        return segments
+    apart = segments.midpoint[:, :, None] - line.point[:, None]
+    nearest = jnp.argmin(dot(apart, apart), axis=2)
+    rise = segments.height - jnp.take_along_axis(line.height, nearest, axis=1)
+    return segments._replace(present=segments.present & (jnp.abs(rise) < elevation.LEVEL_M))
 
 
 def read_centre_line(scene: Scene, state: State, *, behind_m: float, ahead_m: float) -> CentreLine:
@@ -113,7 +130,9 @@ def read_centre_line(scene: Scene, state: State, *, behind_m: float, ahead_m: fl
     known = route_following.find_routed(scene, agents)
     point = jnp.stack([away, jnp.zeros_like(away)], axis=-1)
     direction = jnp.zeros_like(point).at[..., 0].set(1.0)
-    limit, remaining = jnp.zeros_like(away), jnp.zeros_like(motion.yaw)
+    limit, remaining, height = jnp.zeros_like(away), jnp.zeros_like(motion.yaw), None
+    if scene.edges.height is not None:
+        height = jnp.broadcast_to(motion.position[:, 2:], away.shape)
     if scene.routes.length.shape[0]:
         arc, row = state.route.arc[:, None] + away, jnp.broadcast_to(agents.route[:, None], away.shape)
         inside = jnp.clip(arc, 0.0, scene.routes.length[row])
@@ -122,10 +141,13 @@ def read_centre_line(scene: Scene, state: State, *, behind_m: float, ahead_m: fl
         yaw = motion.yaw[:, None]
         point = jnp.where(known[:, None, None], to_frame(on_route - motion.position[:, None, :2], yaw), point)
         direction = jnp.where(known[:, None, None], to_frame(along, yaw), direction)
-        limit = scene.routes.speed_limit[row, jnp.floor(inside / SPACING_M).astype(jnp.int32)]
+        place = jnp.floor(inside / SPACING_M).astype(jnp.int32)
+        limit = scene.routes.speed_limit[row, place]
         limit = jnp.where(jnp.isfinite(limit) & known[:, None], limit, 0.0)
         remaining = jnp.where(known, agents.route_end - state.route.arc, 0.0)
-    return CentreLine(away, point, direction, limit, known, remaining)
+        if height is not None and scene.routes.height is not None:
+            height = jnp.where(known[:, None], scene.routes.height[row, place], height)
+    return CentreLine(away, point, direction, limit, known, remaining, height)
 
 
 def read_stop_lines(scene: Scene, state: State, time_s: Float[Array, ""]) -> StopLinesAhead:
@@ -153,6 +175,7 @@ def find_users(scene: Scene, state: State, *, count: int) -> NearUsers:
     apart = users.position - motion.position[:, None, :2]
     others = users.present & ~jnp.eye(cars, total, dtype=bool)
     index, mask = nearest_rows.select_nearest(jnp.where(others, dot(apart, apart), jnp.inf), count=count)
+    height, climb = _find_heights(scene, motion, users)
     yaw = motion.yaw[:, None]
     return NearUsers(
         position=to_frame(jnp.take_along_axis(apart, index[..., None], axis=1), yaw),
@@ -161,4 +184,16 @@ def find_users(scene: Scene, state: State, *, count: int) -> NearUsers:
         size=users.size[index],
         kind=kind[index],
         present=mask,
+        height=None if height is None else height[index],
+        climb=None if climb is None else climb[index],
     )
+
+
+def _find_heights(
+    scene: Scene, motion: Motion, users: surrogate_safety.RoadUsers
+) -> tuple[Float[Array, " B"] | None, Float[Array, " B"] | None]:
+    """Heights of road users and their vertical speeds on the road, m and m/s; None in a scene of one level."""
+    if scene.edges.height is None or scene.elevation is None:
+        return None, None
+    height = jnp.concatenate([motion.position[:, 2], scene.traffic.elevation])
+    return height, dot(elevation.find_ground(scene.elevation, users.position, height).slope, users.velocity)

@@ -12,6 +12,7 @@ from jaxtyping import Array, Bool, Float, Int
 from scenefactory_jax.core import boxes as rectangles
 from scenefactory_jax.core.geometry import cross, dot, heading_vector, safe_norm
 from scenefactory_jax.core.types import ROUTE_SPACING_M, Boxes, Routes
+from scenefactory_jax.roadgraph.elevation import LEVEL_M
 
 AXLES = 0.6  # distance of the two places that carry a box, over its length: a car's wheelbase
 SHORTEST_M = 0.2  # a shorter chord lies behind the route's end
@@ -23,6 +24,7 @@ class Window(NamedTuple):
     point: Float[Array, "V K 2"]
     arc: Float[Array, "V K"]  # length along the route
     row: Int[Array, "V K"]  # of the route's points
+    height: Float[Array, "V K"] | None = None  # of the road; None: boxes of all levels count
 
 
 class Projection(NamedTuple):
@@ -42,12 +44,13 @@ def read_window(routes: Routes, route: Int[Array, " V"], arc: Float[Array, " V"]
     count = routes.position.shape[1]
     first = jnp.clip(jnp.floor(arc / ROUTE_SPACING_M).astype(jnp.int32), 0, max(count - 2, 0))
     row = jnp.minimum(first[:, None] + stride * jnp.arange(points), count - 1)
-    point = routes.position.reshape(-1, 2)[route[:, None] * count + row]
-    return Window(point, jnp.minimum(ROUTE_SPACING_M * row, routes.length[route][:, None]), row)
+    table, place = routes.position.reshape(-1, 2), route[:, None] * count + row
+    point, arc = table[place], jnp.minimum(ROUTE_SPACING_M * row, routes.length[route][:, None])
+    return Window(point, arc, row, None if routes.height is None else routes.height.reshape(-1)[place])
 
 
 def project_boxes(window: Window, boxes: Boxes) -> Projection:
-    """Projects boxes onto the nearest chords of windows."""
+    """Projects boxes onto the nearest chords of windows; those of another level than the box do not count."""
     start, along = window.point[:, :-1], window.point[:, 1:] - window.point[:, :-1]  # [V, K-1, 2]
     length = safe_norm(along)
     usable = length > SHORTEST_M
@@ -55,7 +58,12 @@ def project_boxes(window: Window, boxes: Boxes) -> Projection:
     relative = boxes.position[None, :, None] - start[:, None]  # [V, B, K-1, 2]
     place = dot(relative, direction[:, None])
     beyond = place - jnp.clip(place, 0.0, length[:, None])
-    distance = jnp.where(usable[:, None], cross(direction[:, None], relative) ** 2 + beyond**2, jnp.inf)
+    counts, present = usable[:, None], None
+    if window.height is not None:  # else a chord far ahead may be at the height of a box under the route
+        beside = jnp.abs(beyond) <= 0.5 * boxes.size[None, :, :1]
+        counts = counts & beside & (jnp.abs(window.height[:, None, :-1] - boxes.elevation[:, None]) < LEVEL_M)
+        present = boxes.present & jnp.any(counts, axis=2)
+    distance = jnp.where(counts, cross(direction[:, None], relative) ** 2 + beyond**2, jnp.inf)
     best = jnp.argmin(distance, axis=2)  # [V, B]
     chord = lambda table: jnp.take_along_axis(table, best, axis=1)  # noqa: E731
     ahead = jnp.stack([chord(direction[..., 0]), chord(direction[..., 1])], axis=-1)
@@ -71,7 +79,7 @@ def project_boxes(window: Window, boxes: Boxes) -> Projection:
         sine=cross(ahead, heading),
         speed=dot(ahead, boxes.velocity[None]),
         drift=cross(ahead, boxes.velocity[None]),
-        valid=boxes.present[None] & chord(usable) & (arc >= low - reach) & (arc <= high + reach),
+        valid=(boxes.present[None] if present is None else present) & chord(usable) & (arc >= low - reach) & (arc <= high + reach),
     )
 
 
@@ -185,8 +193,10 @@ def project_points(routes: Routes, route: Int[Array, " V"], position: Float[Arra
     return jnp.clip(ROUTE_SPACING_M * row + along, 0.0, routes.length[route])
 
 
-def find_overlaps(first: Boxes, second: Boxes) -> Bool[Array, "B C"]:
-    """Mask of the pairs of present boxes that share area."""
+def find_overlaps(first: Boxes, second: Boxes, *, leveled: bool) -> Bool[Array, "B C"]:
+    """Mask of the pairs of present boxes that share area; `leveled`: and a level of the road."""
     position, yaw, size = first.position[:, None], first.yaw[:, None], first.size[:, None]
     overlap = rectangles.find_overlaps(position, yaw, size, second.position, second.yaw, second.size)
+    if leveled:
+        overlap &= jnp.abs(first.elevation[:, None] - second.elevation) < LEVEL_M
     return overlap & first.present[:, None] & second.present[None]

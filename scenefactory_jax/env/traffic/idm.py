@@ -5,6 +5,7 @@ Vehicles without a route stand at their first logged place. People, cyclists and
 still where its next place would overlap a box that it does not overlap yet: so vehicles of this traffic never collide with each other.
 """
 
+import functools
 from typing import Literal, NamedTuple
 
 import jax
@@ -21,6 +22,7 @@ from scenefactory_jax.env.traffic.idm_config import IdmConfig
 from scenefactory_jax.env.traffic.log_playback import VEHICLE, Row, make_masses, read_log
 from scenefactory_jax.env.traffic.right_of_way import Vehicles
 from scenefactory_jax.roadgraph import traffic_lights
+from scenefactory_jax.roadgraph.elevation import LEVEL_M
 
 WAITING, ON_ROAD, GONE = 0, 1, 2
 MOVING_MPS = 1.5  # from which a vehicle no longer counts as waiting
@@ -155,6 +157,8 @@ def enter(scene: Scene, state: IdmState, cars: Boxes, row: Float[Array, ""], con
     speed = jnp.broadcast_to(state.speed[:, None], along.shape)
     ahead, behind = idm_law.compute_safe_gap(speed, along, law), idm_law.compute_safe_gap(along, speed, law)
     near = (jnp.abs(relative[..., 1]) < side + SIDE_M) & (relative[..., 0] < reach + ahead) & (relative[..., 0] > -reach - behind)
+    if scene.routes.height is not None:
+        near &= jnp.abs(scene.traffic.elevation[:, None] - others.elevation) < LEVEL_M
     vehicles = Vehicles(
         arc=state.arc,
         speed=state.speed,
@@ -319,10 +323,10 @@ def find_held(scene: Scene, before: IdmState, after: IdmState, boxes: Boxes, dri
     log, count = scene.traffic_log, len(drives)
     own = replace(scene.traffic, position=before.position, yaw=before.yaw, size=log.size, present=drives)
     new = replace(own, position=after.position, yaw=after.yaw)
-    touched = corridor.find_overlaps(own, boxes)
-    hits = corridor.find_overlaps(new, boxes)
+    overlaps = functools.partial(corridor.find_overlaps, leveled=scene.routes.height is not None)
+    touched, hits = overlaps(own, boxes), overlaps(new, boxes)
     index = jnp.arange(count)
-    later = corridor.find_overlaps(new, new) & (index[:, None] > index)
+    later = overlaps(new, new) & (index[:, None] > index)
     hits = hits.at[:, :count].set(hits[:, :count] | later)
     other = jnp.arange(len(boxes.mass)) != index[:, None]
     return drives & jnp.any(hits & ~touched & other, axis=1)

@@ -21,6 +21,7 @@ from scenefactory_jax.env.traffic import corridor, idm_law
 from scenefactory_jax.env.traffic.corridor import Window
 from scenefactory_jax.env.traffic.idm_law import IdmLaw
 from scenefactory_jax.env.traffic.log_playback import VEHICLE, Row, make_masses, read_log
+from scenefactory_jax.roadgraph.elevation import find_ground_by_lane
 
 KMH = 3.6
 
@@ -197,7 +198,9 @@ def advance(
     track = make_track(log, state.first)
     ahead = jnp.arange(int(driving.look_ahead_m // driving.point_m) + 1) * driving.point_m
     arc = jnp.minimum(state.arc[:, None] + ahead, track.arc[:, -1:])
-    window = Window(interpolate_track(track, arc)[0], arc, jnp.zeros(arc.shape, jnp.int32))
+    point, yaw = interpolate_track(track, arc)
+    ground = None if scene.edges.height is None else find_ground_by_lane(scene, point, yaw)
+    window = Window(point, arc, jnp.zeros(arc.shape, jnp.int32), ground and ground.height)
     places = corridor.project_boxes(window, boxes)
     strip = {
         "size": log.size,

@@ -11,6 +11,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from scenefactory_jax.core.types import ROAD_USERS
 from scenefactory_jax.evaluation.metrics.waymax_steps import Paths
+from scenefactory_jax.roadgraph.elevation import LEVEL_M
 from scenefactory_jax.roadgraph.signed_edge_distance import EdgePoints
 
 VEHICLE, PEDESTRIAN, CYCLIST, OBJECT = range(len(ROAD_USERS))
@@ -34,6 +35,7 @@ class Others(NamedTuple):
     valid: Bool[Array, "O T"]
     size: Float[Array, "O 2"]  # length, width
     kind: Int[Array, " O"]  # index into ROAD_USERS
+    height: Float[Array, "O T"] | None = None  # None: the scene has one level
 
 
 class Lanes(NamedTuple):
@@ -90,6 +92,9 @@ def find_inside(first: Int[Array, ""], last: Int[Array, ""], count: int) -> Bool
 
 
 def leave_out(users: Others, row: Int[Array, ""]) -> Others:
-    """Masks one row of all road users of a scene: those beside the car of this row."""
+    """Masks one row of all road users of a scene, and the states of those on another level: those beside the car of this row."""
     own = jnp.arange(users.kind.shape[0]) == row
-    return users._replace(valid=users.valid & ~own[:, None])
+    valid = users.valid & ~own[:, None]
+    if users.height is not None:
+        valid &= jnp.abs(users.height - users.height[row]) < LEVEL_M
+    return users._replace(valid=valid)

@@ -56,7 +56,7 @@ def make(
         else:
             heading = jnp.zeros_like(speed)
             acceleration, curvature = compute_inverse_action(heading, view.velocity, view.next.yaw, view.next.velocity, dt=action_s)
-        action = tracker.make_action(acceleration, curvature, speed, car)
+        action = tracker.make_action(acceleration, curvature, speed, car, grade=view.grade)
         action = jnp.where(view.valid[..., None], action, tracker.make_braking_action(speed, car))
         return action, jnp.full(3, -jnp.inf), jnp.zeros_like(speed)
 

@@ -69,7 +69,9 @@ def make(
         demand = idm_law.compute_interaction(speed, gap, leader_speed, model)
         demand = jnp.maximum(demand, idm_law.compute_interaction(speed, line, jnp.zeros_like(line), model))
         acceleration = jnp.maximum(idm_law.compute_acceleration(speed, target, demand, model), -max_braking_mps2)
-        return route_tracking.make_action(acceleration, route, speed, tracker), jnp.full(3, -jnp.inf), jnp.zeros_like(speed)
+        grade = route_tracking.read_grade(observation, observations)
+        action = route_tracking.make_action(acceleration, route, speed, tracker, grade=grade)
+        return action, jnp.full(3, -jnp.inf), jnp.zeros_like(speed)
 
     return Policy(init, apply)
 

@@ -76,7 +76,7 @@ def make(
         speed = view.velocity[..., 0]
         flat = jax.tree.map(lambda leaf: leaf.reshape(math.prod(speed.shape), *leaf.shape[speed.ndim :]), view)
         acceleration, curvature = (leaf.reshape(speed.shape) for leaf in jax.vmap(drive)(flat))
-        action = tracker.make_action(acceleration, curvature, speed, car)
+        action = tracker.make_action(acceleration, curvature, speed, car, grade=view.grade)
         action = jnp.where(view.line.known[..., None], action, tracker.make_braking_action(speed, car))
         return action, jnp.full(3, -jnp.inf), jnp.zeros_like(speed)
 

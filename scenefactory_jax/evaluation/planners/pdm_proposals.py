@@ -98,6 +98,7 @@ def find_leaders(view: PlanningView, offset: Float[Array, " N"], config: Proposa
     count, moments = users.yaw.shape[0], times.shape[0]
     boxes = make_future_boxes(users, times)
     window = corridor.Window(line.point[None, ::CHORD], line.arc[None, ::CHORD], jnp.zeros((1, line.arc[::CHORD].shape[0]), jnp.int32))
+    window = window._replace(height=None if line.height is None else line.height[None, ::CHORD])
     places = corridor.project_boxes(window, boxes)
     across, lengthwise = corridor.find_extents(places, boxes)
     split = lambda row: row.reshape(moments, 1, count)  # noqa: E731
@@ -113,9 +114,10 @@ def make_future_boxes(users: NearUsers, times: Float[Array, " S"]) -> Boxes:
     position = users.position + times[:, None, None] * users.velocity
     repeat = lambda leaf: jnp.broadcast_to(leaf, (len(times), *leaf.shape)).reshape(-1, *leaf.shape[1:])  # noqa: E731
     zero = jnp.zeros(position.shape[0] * position.shape[1], jnp.float32)
+    height = find_user_heights(users, times)
     return Boxes(
         position=position.reshape(-1, 2),
-        elevation=zero,
+        elevation=zero if height is None else height.reshape(-1),
         yaw=repeat(users.yaw),
         velocity=repeat(users.velocity),
         yaw_rate=zero,
@@ -123,6 +125,11 @@ def make_future_boxes(users: NearUsers, times: Float[Array, " S"]) -> Boxes:
         mass=zero,
         present=repeat(users.present),
     )
+
+
+def find_user_heights(users: NearUsers, times: Float[Array, " S"]) -> Float[Array, "S K"] | None:
+    """Finds the heights of road users at all times, at constant velocities along the road; None in a scene of one level."""
+    return None if users.height is None or users.climb is None else users.height + times[:, None] * users.climb
 
 
 def find_stop_distance(view: PlanningView, *, comfortable: Braking, hardest: Braking) -> Float[Array, ""]:

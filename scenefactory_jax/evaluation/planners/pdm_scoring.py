@@ -19,7 +19,9 @@ from scenefactory_jax.core.schema import Bounds, Count, NonNegative, Positive
 from scenefactory_jax.core.types import ROAD_USERS
 from scenefactory_jax.env.observations.near_segments import NearSegments
 from scenefactory_jax.env.observations.planning import NearUsers, PlanningView
+from scenefactory_jax.evaluation.planners.pdm_proposals import find_row, find_user_heights
 from scenefactory_jax.evaluation.planners.pdm_simulation import Car
+from scenefactory_jax.roadgraph.elevation import LEVEL_M
 
 FRONT_M = 0.1  # length of the strip that counts as the front of a box
 Angle = Annotated[float, Bounds(min=0, max=180)]
@@ -86,9 +88,10 @@ def score(
     sampled = Car(*(leaf[:, :: config.stride] for leaf in car))
     times = dt_s * config.stride * jnp.arange(sampled.speed.shape[1])
     centre = sampled.position + rear_m * heading_vector(sampled.yaw)
+    arcs = arc[:, :: config.stride]
     wide = jnp.abs(offset[:, :: config.stride]) + 0.5 * view.size[1] > config.lane_half_width_m
-    no_collision, collision_s, hit = find_collisions(view, sampled, centre, wide, times, config)
-    ttc = check_ttc(view, sampled, centre, wide, times, hit, config)
+    no_collision, collision_s, hit = find_collisions(view, sampled, centre, arcs, wide, times, config)
+    ttc = check_ttc(view, sampled, centre, arcs, wide, times, hit, config)
     drivable = check_drivable(view.edges, centre, sampled.yaw, view.size, margin_m=config.edge_margin_m)
     direction = check_direction(view.lanes, sampled, centre, config, dt_s=dt_s * config.stride)
     gates = no_collision * drivable * direction
@@ -110,7 +113,8 @@ def find_bearings(view: PlanningView, car: Car, times: Float[Array, " S"]) -> Fl
 
 
 def find_collisions(
-    view: PlanningView, car: Car, centre: Float[Array, "N S 2"], wide: Bool[Array, "N S"], times: Float[Array, " S"], config: ScoreConfig
+    view: PlanningView, car: Car, centre: Float[Array, "N S 2"], arc: Float[Array, "N S"], wide: Bool[Array, "N S"],
+    times: Float[Array, " S"], config: ScoreConfig,
 ) -> tuple[Float[Array, " N"], Float[Array, " N"], Bool[Array, "N S K"]]:  # fmt: skip
     """Finds collisions at fault, as nuPlan: with road users that stand or that the car's front hits, and, where the car is not within one
     lane, with those beside it. The first collision with a road user counts; those that overlap at present do not.
@@ -123,7 +127,8 @@ def find_collisions(
     users = view.users
     place = users.position + times[:, None, None] * users.velocity
     margins = (0.0, config.user_margin_m)
-    overlaps = [_overlap(centre, car.yaw, view.size + 2.0 * margin, place, users) & users.present for margin in margins]
+    present = find_present(view, arc, times)
+    overlaps = [_overlap(centre, car.yaw, view.size + 2.0 * margin, place, users) & present for margin in margins]
     overlap = jnp.any(jnp.stack([new & ~new[:, :1] for new in overlaps]), axis=0)
     bearing = find_bearings(view, car, times)
     front = centre + 0.5 * (view.size[0] - FRONT_M) * heading_vector(car.yaw)
@@ -140,6 +145,14 @@ def find_collisions(
     return result, collision_s, jnp.cumsum(overlap, axis=1) > 0
 
 
+def find_present(view: PlanningView, arc: Float[Array, "N S"], times: Float[Array, " S"]) -> Bool[Array, "*n K"]:
+    """Mask of the road users, of those that are on the level of the line at some lengths along it at some times."""
+    height = find_user_heights(view.users, times)
+    if height is None or view.line.height is None:
+        return view.users.present
+    return view.users.present & (jnp.abs(view.line.height[find_row(view.line, arc)][..., None] - height) < LEVEL_M)
+
+
 def _overlap(
     centre: Float[Array, "N S 2"], yaw: Float[Array, "N S"], size: Float[Array, "2"], place: Float[Array, "S K 2"], users: NearUsers
 ) -> Bool[Array, "N S K"]:
@@ -148,8 +161,8 @@ def _overlap(
 
 
 def check_ttc(
-    view: PlanningView, car: Car, centre: Float[Array, "N S 2"], wide: Bool[Array, "N S"], times: Float[Array, " S"],
-    hit: Bool[Array, "N S K"], config: ScoreConfig,
+    view: PlanningView, car: Car, centre: Float[Array, "N S 2"], arc: Float[Array, "N S"], wide: Bool[Array, "N S"],
+    times: Float[Array, " S"], hit: Bool[Array, "N S K"], config: ScoreConfig,
 ) -> Float[Array, " N"]:  # fmt: skip
     """Returns 1 for proposals whose boxes, moved on straight from any step for `projections_s`, meet no road user ahead, else 0.
 
@@ -158,12 +171,13 @@ def check_ttc(
     """
     users, bearing = view.users, find_bearings(view, car, times)
     counts = (bearing < jnp.deg2rad(config.ahead_deg)) | (wide[..., None] & (bearing < jnp.deg2rad(config.behind_deg)))
-    counts &= users.present & ~hit & (car.speed > config.stopped_mps)[..., None]
+    counts &= ~hit & (car.speed > config.stopped_mps)[..., None]
     meets = jnp.zeros(car.speed.shape[0], bool)
     for ahead_s in config.projections_s:
         moved = centre + (ahead_s * car.speed)[..., None] * heading_vector(car.yaw)
         place = users.position + (times + ahead_s)[:, None, None] * users.velocity
-        meets |= jnp.any(_overlap(moved, car.yaw, view.size, place, users) & counts, axis=(1, 2))
+        present = find_present(view, arc + ahead_s * car.speed, times + ahead_s)
+        meets |= jnp.any(_overlap(moved, car.yaw, view.size, place, users) & counts & present, axis=(1, 2))
     return (~meets).astype(jnp.float32)
 
 

@@ -43,7 +43,8 @@ def make(
         route = route_tracking.read_route(observation["route"], observations["route"])
         speed = observations["ego"]["speed_scale_mps"] * observation["ego"][..., 5]
         target = route_tracking.compute_target_speed(route, jnp.full_like(route.limit, speed_mps), tracker)
-        action = route_tracking.make_action((target - speed) / response_s, route, speed, tracker)
+        grade = route_tracking.read_grade(observation, observations)
+        action = route_tracking.make_action((target - speed) / response_s, route, speed, tracker, grade=grade)
         return action, jnp.full(3, -jnp.inf), jnp.zeros_like(speed)
 
     return Policy(init, apply)

@@ -118,7 +118,20 @@ def compute_target_speed(
     return jnp.min(jnp.sqrt(slowest**2 + 2.0 * braking * route.arc), axis=-1)
 
 
-def make_action(acceleration: Float[Array, "*n"], route: RouteAhead, speed: Float[Array, "*n"], tracker: Tracker) -> Float[Array, "*n 3"]:
+def read_grade(observation: Mapping[str, Any], scales: Mapping[str, Any]) -> Float[Array, "*n"] | None:
+    """Reads the grade under the car from the group `grade_ahead`; None where it is not observed."""
+    ahead = observation.get("grade_ahead")
+    return None if ahead is None else scales["grade_ahead"]["grade_scale"] * ahead[..., 0]
+
+
+def make_action(
+    acceleration: Float[Array, "*n"],
+    route: RouteAhead,
+    speed: Float[Array, "*n"],
+    tracker: Tracker,
+    *,
+    grade: Float[Array, "*n"] | None = None,
+) -> Float[Array, "*n 3"]:
     """Makes the action that follows the route with an acceleration; an agent without a route brakes."""
-    follow = tracking.make_action(acceleration, compute_curvature(route, speed, tracker), speed, tracker)
+    follow = tracking.make_action(acceleration, compute_curvature(route, speed, tracker), speed, tracker, grade=grade)
     return jnp.where(route.known[..., None] > 0, follow, tracking.make_braking_action(speed, tracker))

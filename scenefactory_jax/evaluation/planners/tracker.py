@@ -9,9 +9,11 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from scenefactory_jax.core.schema import Bounds, ConfigError, NonNegative, Positive
+from scenefactory_jax.dynamics.articulated.parameters import GRAVITY
 
 DEFAULT = "articulated_car"  # where a policy is made without the config of its run
 SMALLEST_MPS = 0.1  # slower, the power of the engine is no limit
+HOLD = 2.0  # times the weight along the road: brakes that hold a car for certain
 
 
 @dataclasses.dataclass(frozen=True)
@@ -32,6 +34,7 @@ class Tracker:
     look_ahead_s: NonNegative
     lateral_mps2: Positive
     braking_mps2: Positive
+    feels_grades: bool
 
 
 def select_tracker(trackers: Mapping[str, Tracker], dynamics: Mapping[str, Any] | None) -> Tracker:
@@ -60,18 +63,31 @@ def find_largest_angle(tracker: Tracker) -> float:
 
 
 def make_action(
-    acceleration: Float[Array, "*n"], curvature: Float[Array, "*n"], speed: Float[Array, "*n"], tracker: Tracker
+    acceleration: Float[Array, "*n"],
+    curvature: Float[Array, "*n"],
+    speed: Float[Array, "*n"],
+    tracker: Tracker,
+    *,
+    grade: Float[Array, "*n"] | None = None,
 ) -> Float[Array, "*n 3"]:
     """Makes the action for an acceleration (m/s^2) and a curvature (1/m) at a speed (m/s).
 
     Rolling resistance and air drag are added to what the engine gives and subtracted from what the brakes do. A throttle below zero and
     the brake say the same, so that actions with one pedal, with two and with an acceleration do the same.
+
+    Args:
+        grade: rise over run of the road under the car along its heading, whose gravity is added, too; a car that is to stand there has its
+            brakes on. None: the road is flat.
     """
     speed = jnp.maximum(speed, 0.0)
     if tracker.stop_s > 0:
         acceleration = jnp.maximum(acceleration, -speed / tracker.stop_s)
     push = acceleration + tracker.rolling_mps2 + tracker.air_drag_radpm * speed**2
-    push = jnp.where((speed < SMALLEST_MPS) & (acceleration <= 0), jnp.minimum(acceleration, 0.0), push)  # a car that stands has no drag
+    standing = jnp.minimum(acceleration, 0.0)  # a car that stands has no drag
+    if grade is not None and tracker.feels_grades:
+        weight = GRAVITY * grade / jnp.sqrt(1.0 + grade**2)
+        push, standing = push + weight, standing - HOLD * jnp.abs(weight)
+    push = jnp.where((speed < SMALLEST_MPS) & (acceleration <= 0), standing, push)
     available = jnp.full_like(speed, tracker.throttle_mps2)
     if tracker.power_m2ps3 is not None:
         available = jnp.minimum(available, tracker.power_m2ps3 / jnp.maximum(speed, SMALLEST_MPS))

@@ -6,7 +6,8 @@ import numpy as np
 from jaxtyping import Bool, Float, Num
 
 from scenefactory_jax.core.trajectory import Trajectory
-from scenefactory_jax.core.types import CROSSWALK, DRIVABLE, DRIVEWAY, LANE_BIKE, SPEED_BUMP, Road
+from scenefactory_jax.core.types import CROSSWALK, DRIVABLE, DRIVEWAY, LANE_BIKE, SPEED_BUMP, Road, Scene
+from scenefactory_jax.visualization import road_levels
 
 Colour = tuple[int, int, int]
 
@@ -195,7 +196,12 @@ _LOOKS: tuple[tuple[tuple[int, ...], Colour, float, float, bool], ...] = (
 _DASH, _PERIOD = 3.0, 9.0  # m
 
 
-def strokes(road: Road) -> list[Stroke]:
+def strokes(scene: Scene, *, first: int = 0) -> list[Stroke]:
+    """Lines of a scene's roads, bottom first: level after level, from the first one that is to be drawn."""
+    return [stroke for level in road_levels.list_levels(scene)[first:] for stroke in _strokes(level.road)]
+
+
+def _strokes(road: Road) -> list[Stroke]:
     """Lines of a road, bottom first. Broken lines have 3 m dashes and 6 m gaps along the polyline, across segments."""
     valid = np.asarray(road.valid, bool)
     kind, arc, half = (np.asarray(column)[valid] for column in (road.kind, road.arc, road.half_length))

@@ -123,7 +123,7 @@ def draw_road(axes: Axes, scene: Scene, window: tuple[float, float, float], *, i
     left, bottom, side = window
     scale = inches * 72 / side
     axes.set(xlim=(left, left + side), ylim=(bottom, bottom + side), aspect="equal", facecolor=rgb(GROUND))
-    lines = drawing.strokes(scene.road)
+    lines = drawing.strokes(scene)
     below = 1 + (patch_overlay.count_strokes_below(lines) - 0.5) / 100
     patches = patch_overlay.areas(scene.weather)
     for rank, area in enumerate(patches):  # all pieces with their edge first, then filled: the edge surrounds their union
@@ -195,7 +195,7 @@ def _add_legend(figure: Figure, events: Iterable[str], *, car: str, scene: Scene
     box, first = (4, 0, 45), drawing.AGENTS[0]
     handles = [point(box, first, f"car at its {car}", markersize=7.0), point("o", first, "its goal", markerfacecolor="none")]
     if road:
-        drawn = {stroke.colour for stroke in drawing.strokes(scene.road)}
+        drawn = {stroke.colour for stroke in drawing.strokes(scene)}
         handles += [Line2D([], [], color=rgb(colour), linewidth=width, label=label) for label, colour, width in _ROAD if colour in drawn]
     signs = np.asarray(scene.controls.stop_sign, bool)[np.asarray(scene.controls.valid, bool)]
     if signs.any():

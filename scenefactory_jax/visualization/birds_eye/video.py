@@ -9,21 +9,21 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
-import matplotlib
 import numpy as np
 from jaxtyping import UInt8
-from PIL import Image, ImageDraw, ImageFont
+from PIL import Image, ImageDraw
+from PIL.ImageFont import FreeTypeFont
 
 from scenefactory_jax.core.trajectory import Trajectory
 from scenefactory_jax.visualization import video_file
 from scenefactory_jax.visualization.birds_eye import control_marks, drawing, patch_overlay, traffic_shapes
+from scenefactory_jax.visualization.birds_eye.bridges import Bridges, find_bridges
 from scenefactory_jax.visualization.birds_eye.control_marks import ControlMarks
-from scenefactory_jax.visualization.birds_eye.drawing import GROUND, INK, MARKS, QUIET, WHITE, Colour, Stroke, View
-from scenefactory_jax.visualization.birds_eye.patch_overlay import Area
+from scenefactory_jax.visualization.birds_eye.drawing import GROUND, INK, MARKS, QUIET, WHITE, Colour, View
+from scenefactory_jax.visualization.birds_eye.road_picture import FINE, load_font, road_image
 from scenefactory_jax.visualization.video_file import VideoError
 
 SETTINGS = ("fps", "stride", "columns", "panel", "trail_s", "routes")  # of `write`
-_FINE = 2  # pictures are drawn at this many times their size and reduced
 _FLASH_S, _FADE_S = 1.2, 0.6  # duration of an event's flash, and of a finished car's fading
 _GAP = 14  # pixels between panels
 _BINS = 6  # steps of fading along a trail
@@ -36,6 +36,7 @@ class _Panel(NamedTuple):
     trajectory: Trajectory
     view: View
     background: Image.Image
+    bridges: Bridges
     track: np.ndarray  # [T, A, 2] pixels
     driven: np.ndarray  # [T, A]
     opacity: np.ndarray  # [T, A] 1 while active, then fading to 0
@@ -134,26 +135,27 @@ def _draw_sheets(panels: list[_Panel], *, stride: int, columns: int, side: int, 
 def _prepare(trajectory: Trajectory, side: int, window: tuple[float, float, float] | None = None, *, routes: bool = False) -> _Panel:
     """Computes what does not change from frame to frame; without a window the view contains all positions and goals."""
     trajectory = drawing.sanitize_trajectory(trajectory)
-    view = View(*(window or drawing.fit_view(drawing.shown_points(trajectory), margin=9.0, smallest=50.0)), side * _FINE)
+    view = View(*(window or drawing.fit_view(drawing.shown_points(trajectory), margin=9.0, smallest=50.0)), side * FINE)
     steps = np.arange(len(trajectory.active))[:, None]
     last = np.maximum.accumulate(np.where(trajectory.active, steps, -10_000), axis=0)
     events = {name: new & trajectory.present for name, new in trajectory.events.items()}
     respawns = drawing.find_respawns(trajectory)
-    small, bold = max(9, side // 44), _font(max(9, side // 44), bold=True)
-    lines = [*drawing.strokes(trajectory.scene.road), *(control_marks.route_strokes(trajectory.scene) if routes else [])]
+    small, bold = max(9, side // 44), load_font(max(9, side // 44), bold=True)
+    lines = [*drawing.strokes(trajectory.scene), *(control_marks.route_strokes(trajectory.scene) if routes else [])]
     marks = control_marks.find_marks(trajectory.scene, trajectory.start_s + np.arange(len(trajectory.active)) / trajectory.control_hz)
     numbers = [(str(agent), drawing.blend(drawing.colour_of(agent), INK, 0.7)) for agent in range(len(trajectory.present))]
     return _Panel(
         trajectory=trajectory,
         view=view,
         background=road_image(lines, view, patches=patch_overlay.areas(trajectory.scene.weather)),
+        bridges=find_bridges(trajectory, view),
         track=drawing.to_pixels(view, trajectory.position),
         driven=drawing.is_moving(trajectory),
         opacity=np.clip(1 - (steps - last) / (_FADE_S * trajectory.control_hz), 0.0, 1.0) * trajectory.present,
         past_events=sorted((int(t), int(a), name) for name, new in events.items() for t, a in np.argwhere(new)),
         counts={n: np.cumsum(e.sum(1)) if respawns else np.maximum.accumulate(e, axis=0).sum(1) for n, e in events.items()},
         numbers=[_label(number, bold, colour) for number, colour in numbers],
-        goals=[_label(number, _font(small * _FINE), colour) for number, colour in numbers],
+        goals=[_label(number, load_font(small * FINE), colour) for number, colour in numbers],
         labels={name: _label(mark.label, bold, mark.colour) for name, mark in MARKS.items()},
         parked=np.zeros(0, bool) if trajectory.traffic is None else traffic_shapes.find_parked(trajectory.traffic),
         marks=marks,
@@ -161,74 +163,48 @@ def _prepare(trajectory: Trajectory, side: int, window: tuple[float, float, floa
     )
 
 
-def road_image(lines: Sequence[Stroke], view: View, *, patches: Sequence[Area] = ()) -> Image.Image:
-    """Draws a road and its patches in a window, with a 20 m scale bar in the lower left corner."""
-    fine = view._replace(pixels=view.pixels * 2)
-    image = Image.new("RGB", (fine.pixels, fine.pixels), GROUND)
-    draw = ImageDraw.Draw(image)
-    scale = fine.pixels / view.side
-    first = patch_overlay.count_strokes_below(list(lines))
-    for order, stroke in enumerate(lines):
-        if order == first:
-            _draw_areas(draw, fine, patches)
-        width = max(stroke.width * scale, stroke.thinnest * _FINE * 2)
-        ends = drawing.to_pixels(fine, stroke.lines)
-        near = (ends.max(axis=(1, 2)) > -width) & (ends.min(axis=(1, 2)) < fine.pixels + width)
-        for (x0, y0), (x1, y1) in ends[near]:
-            draw.line((x0, y0, x1, y1), fill=stroke.colour, width=round(width))
-            if width > 6:  # round ends close the gaps between the segments of a bend
-                for x, y in ((x0, y0), (x1, y1)):
-                    draw.ellipse((x - width / 2, y - width / 2, x + width / 2, y + width / 2), fill=stroke.colour)
-    if first == len(lines):
-        _draw_areas(draw, fine, patches)
-    left, low, thick = 0.03 * fine.pixels, 0.97 * fine.pixels, 0.004 * fine.pixels
-    draw.rectangle((left, low - thick, left + 20.0 * scale, low), fill=INK)
-    draw.text((left, low - 2 * thick), "20 m", font=_font(round(fine.pixels / 38)), fill=INK, anchor="lb")
-    return image.reduce(2)
-
-
-def _draw_areas(draw: ImageDraw.ImageDraw, view: View, patches: Sequence[Area]) -> None:
-    """Patches, each with an edge around the union of its pieces."""
-    for area in patches:
-        pieces = [drawing.to_pixels(view, piece).ravel().tolist() for piece in area.pieces]
-        for piece in pieces:  # a line reaches to both sides, a polygon's own outline only inwards
-            draw.line([*piece, *piece[:4]], fill=area.edge, width=3 * _FINE, joint="curve")
-        for piece in pieces:
-            draw.polygon(piece, fill=area.colour)
-
-
 def _draw_world(panel: _Panel, now: int, *, trail_s: float | int) -> Image.Image:
     """Draws the picture between header and footer at one step."""
     trajectory, image = panel.trajectory, panel.background.copy()
     draw = ImageDraw.Draw(image)
     _draw_controls(draw, panel, now)
-    if trajectory.traffic is not None:
-        for shape in traffic_shapes.shapes(trajectory.traffic, now, panel.parked):
-            corners = (drawing.to_pixels(panel.view, shape.points) - 0.5).ravel().tolist()
-            draw.polygon(corners, fill=shape.fill, outline=shape.outline, width=_FINE // 2)
-    _draw_trails(draw, panel, now, round(trail_s * trajectory.control_hz))
     visible = np.flatnonzero(panel.opacity[now] > 0)
+    if panel.bridges.mask is not None:
+        _draw_cars(draw, panel, now, covered=True)
+        image.paste(panel.background, mask=panel.bridges.mask)
+    _draw_trails(draw, panel, now, round(trail_s * trajectory.control_hz))
     _draw_goals(image, panel, now, visible)
-    for agent in visible:
-        _draw_car(draw, panel, now, int(agent), float(panel.opacity[now, agent]))
+    _draw_cars(draw, panel, now, covered=False)
     flashes = _draw_marks(draw, panel, now)
-    image = image.reduce(_FINE)
+    image = image.reduce(FINE)
     lift = 0.5 * np.hypot(*trajectory.size.T) * image.width / panel.view.side
     for agent in visible[panel.opacity[now, visible] == 1.0]:
-        x, y = panel.track[now, agent] / _FINE
+        x, y = panel.track[now, agent] / FINE
         _stamp(image, panel.numbers[agent], x, y - lift[agent] - 5)
     for x, y, name in flashes:
-        _stamp(image, panel.labels[name], x / _FINE, y / _FINE + 22)
+        _stamp(image, panel.labels[name], x / FINE, y / FINE + 22)
     return image
+
+
+def _draw_cars(draw: ImageDraw.ImageDraw, panel: _Panel, now: int, *, covered: bool) -> None:
+    """The traffic, then the agents, that are under a bridge, or that are not."""
+    traffic = panel.trajectory.traffic
+    if traffic is not None:
+        traffic = traffic._replace(present=traffic.present & (panel.bridges.traffic == covered))
+        for shape in traffic_shapes.shapes(traffic, now, panel.parked):
+            corners = (drawing.to_pixels(panel.view, shape.points) - 0.5).ravel().tolist()
+            draw.polygon(corners, fill=shape.fill, outline=shape.outline, width=FINE // 2)
+    for agent in np.flatnonzero((panel.opacity[now] > 0) & (panel.bridges.cars[now] == covered)):
+        _draw_car(draw, panel, now, int(agent), float(panel.opacity[now, agent]))
 
 
 def _draw_controls(draw: ImageDraw.ImageDraw, panel: _Panel, now: int) -> None:
     """Stop lines in the colours of their lights, and stop signs."""
-    width = max(round(0.7 * panel.view.pixels / panel.view.side), 2 * _FINE)
+    width = max(round(0.7 * panel.view.pixels / panel.view.side), 2 * FINE)
     for bar, colour in control_marks.find_bars(panel.marks, now):
         draw.line((drawing.to_pixels(panel.view, bar) - 0.5).ravel().tolist(), fill=colour, width=width)
     for octagon in panel.octagons:
-        draw.polygon(octagon.ravel().tolist(), fill=drawing.STOP, outline=WHITE, width=_FINE // 2)
+        draw.polygon(octagon.ravel().tolist(), fill=drawing.STOP, outline=WHITE, width=FINE // 2)
 
 
 def _draw_trails(draw: ImageDraw.ImageDraw, panel: _Panel, now: int, length: int) -> None:
@@ -237,7 +213,7 @@ def _draw_trails(draw: ImageDraw.ImageDraw, panel: _Panel, now: int, length: int
     for first, last in itertools.pairwise(edges):
         opacity = 0.75 * (1 - (now - last) / max(length, 1)) + 0.1
         for agent in np.flatnonzero(panel.driven[first + 1 : last + 1].any(axis=0)):
-            look = {"fill": drawing.blend(drawing.colour_of(int(agent)), drawing.ASPHALT, opacity), "width": 2 * _FINE}
+            look = {"fill": drawing.blend(drawing.colour_of(int(agent)), drawing.ASPHALT, opacity), "width": 2 * FINE}
             track, driven = panel.track[first : last + 1, agent], panel.driven[first + 1 : last + 1, agent]
             if driven.all():
                 draw.line(track.ravel().tolist(), joint="curve", **look)
@@ -252,7 +228,7 @@ def _draw_goals(image: Image.Image, panel: _Panel, now: int, agents: np.ndarray)
     for agent, (x, y) in zip(agents, drawing.to_pixels(panel.view, drawing.goal_at(panel.trajectory, now)[agents]), strict=True):
         opacity = float(panel.opacity[now, agent])
         colour = drawing.blend(drawing.colour_of(int(agent)), drawing.ASPHALT, 0.9 * opacity)
-        draw.ellipse((x - radius, y - radius, x + radius, y + radius), outline=colour, width=round(1.6 * _FINE))
+        draw.ellipse((x - radius, y - radius, x + radius, y + radius), outline=colour, width=round(1.6 * FINE))
         if opacity == 1.0:
             _stamp(image, panel.goals[agent], x, y)
 
@@ -265,7 +241,7 @@ def _draw_car(draw: ImageDraw.ImageDraw, panel: _Panel, now: int, agent: int, op
     for shape, fill, outline in parts:
         corners = (drawing.to_pixels(panel.view, shape) - 0.5).ravel().tolist()
         line = None if outline is None else drawing.blend(outline, drawing.ASPHALT, opacity)
-        draw.polygon(corners, fill=drawing.blend(fill, drawing.ASPHALT, opacity), outline=line, width=_FINE)
+        draw.polygon(corners, fill=drawing.blend(fill, drawing.ASPHALT, opacity), outline=line, width=FINE)
 
 
 def _draw_marks(draw: ImageDraw.ImageDraw, panel: _Panel, now: int) -> list[tuple[float, float, str]]:
@@ -276,8 +252,8 @@ def _draw_marks(draw: ImageDraw.ImageDraw, panel: _Panel, now: int) -> list[tupl
         if age < 0 or (age > 1 and name == "goal_reached"):
             continue
         x, y = (float(v) for v in panel.track[step, agent])
-        size = (7.0 + 6.0 * (1 - age) if age <= 1 else 5.0) * _FINE
-        _draw_mark(draw, name, x, y, size, thick=2 * _FINE)
+        size = (7.0 + 6.0 * (1 - age) if age <= 1 else 5.0) * FINE
+        _draw_mark(draw, name, x, y, size, thick=2 * FINE)
         if age <= 1:
             flashes.append((x, y, name))
     return flashes
@@ -310,9 +286,9 @@ def _draw_mark(draw: ImageDraw.ImageDraw, name: str, x: float, y: float, size: f
 
 def _draw_header(sheet: Image.Image, left: int, top: int, panel: int, trajectory: Trajectory) -> None:
     """Title and weather above a panel."""
-    draw, bar, small = ImageDraw.Draw(sheet), _bar(panel), _font(_text_size(panel))
+    draw, bar, small = ImageDraw.Draw(sheet), _bar(panel), load_font(_text_size(panel))
     draw.text((left + panel, top + bar // 2), trajectory.weather, font=small, fill=QUIET, anchor="rm")
-    bold, title = _font(_text_size(panel), bold=True), trajectory.title
+    bold, title = load_font(_text_size(panel), bold=True), trajectory.title
     room = panel - small.getlength(trajectory.weather) - 12
     while bold.getlength(title) > room and len(title) > 2:
         title = title[:-2].rstrip() + "…"
@@ -321,7 +297,7 @@ def _draw_header(sheet: Image.Image, left: int, top: int, panel: int, trajectory
 
 def _draw_footer(sheet: Image.Image, left: int, top: int, side: int, panel: _Panel, now: int) -> None:
     """Time and event counts below a panel; counts of zero are left out first where the width is too small."""
-    draw, bar, font = ImageDraw.Draw(sheet), _bar(side), _font(_text_size(side))
+    draw, bar, font = ImageDraw.Draw(sheet), _bar(side), load_font(_text_size(side))
     draw.rectangle((left, top, left + side, top + bar - 1), fill=WHITE)
     clock = f"{now / panel.trajectory.control_hz:.1f} s"
     draw.text((left, top + bar // 2), clock, font=font, fill=INK, anchor="lm")
@@ -340,7 +316,7 @@ def _draw_footer(sheet: Image.Image, left: int, top: int, side: int, panel: _Pan
 
 def _draw_legend(sheet: Image.Image, top: int, panel: int, *, shown: Sequence[str], speed: float) -> None:
     """Meaning of the marks, and the speed of the video, along the bottom."""
-    draw, font = ImageDraw.Draw(sheet), _font(_text_size(panel) - 1)
+    draw, font = ImageDraw.Draw(sheet), load_font(_text_size(panel) - 1)
     x, middle = _GAP + 8, top + _bar(panel) // 2 - 2
     for name, mark in {name: MARKS[name] for name in shown}.items():
         patch = Image.new("RGB", (64, 64), WHITE)
@@ -362,7 +338,7 @@ def _stamp(image: Image.Image, sprite: Image.Image, x: float, y: float) -> None:
     image.paste(sprite, (left, top), sprite)
 
 
-def _label(text: str, font: ImageFont.FreeTypeFont, colour: Colour) -> Image.Image:
+def _label(text: str, font: FreeTypeFont, colour: Colour) -> Image.Image:
     """A text with a light halo, on a transparent background."""
     left, top, right, bottom = (round(v) for v in font.getbbox(text, stroke_width=2))
     image = Image.new("RGBA", (right - left, bottom - top), (*GROUND, 0))
@@ -377,12 +353,6 @@ def _bar(panel: int) -> int:
 
 def _text_size(panel: int) -> int:
     return max(11, round(panel / 36))
-
-
-def _font(size: int, *, bold: bool = False) -> ImageFont.FreeTypeFont:
-    """DejaVu Sans, which matplotlib ships."""
-    name = "DejaVuSans-Bold.ttf" if bold else "DejaVuSans.ttf"
-    return ImageFont.truetype(str(Path(matplotlib.get_data_path()) / "fonts" / "ttf" / name), max(size, 8))
 
 
 def _key_colours() -> list[Colour]:

@@ -14,6 +14,7 @@ from scenefactory_jax.core.trajectory import TrafficBoxes
 from scenefactory_jax.core.types import Scene
 from scenefactory_jax.dynamics.articulated.parameters import CarParameters
 from scenefactory_jax.env.rollout import Recording
+from scenefactory_jax.visualization import road_levels
 from scenefactory_jax.visualization.birds_eye import control_marks
 from scenefactory_jax.visualization.birds_eye.control_marks import ControlMarks
 from scenefactory_jax.visualization.birds_eye.drawing import colour_of, rgb
@@ -39,6 +40,8 @@ class ActorTrajectories(NamedTuple):
     traffic: TrafficBoxes
     hz: float
     marks: ControlMarks  # lights and stop signs
+    road: Float[np.ndarray, "T A"]  # height under the cars
+    traffic_road: Float[np.ndarray, "T O"]  # ... and under the traffic
 
 
 def make_actors(recording: Recording, index: int, car: CarParameters) -> ActorTrajectories:
@@ -53,13 +56,17 @@ def make_actors(recording: Recording, index: int, car: CarParameters) -> ActorTr
     if shots.joints is None:
         spin = np.cumsum(np.nan_to_num(shots.speed) * active, axis=0) / hz / car.wheel_radius
         joints = scene_model.set_posture(car, shots.position, shots.yaw, shots.steer, spin)
+        joints = scene_model.stand_on_road(scene, joints, np.zeros(active.shape) if shots.height is None else shots.height)
     else:
         joints = np.asarray(shots.joints, float)
     begun = np.maximum.accumulate(active, axis=0)
     opacity = np.where(begun, np.clip(1.0 - (steps - row) / (FADE_S * hz), 0.0, 1.0), 0.0)
     yaw, goal = shots.yaw[row, agents], shots.goal[row, agents]
     boxes, marks = TrafficBoxes.from_boxes(shots.traffic), control_marks.find_marks(scene, shots.time_s)
-    return ActorTrajectories(scene, joints[row, agents], yaw, active, opacity, goal, boxes, hz, marks)
+    joints = joints[row, agents]
+    road = road_levels.measure_road(scene, joints[..., :2], joints[..., 2])
+    traffic_road = road_levels.measure_road(scene, boxes.position, np.asarray(boxes.elevation))
+    return ActorTrajectories(scene, joints, yaw, active, opacity, goal, boxes, hz, marks, road, traffic_road)
 
 
 def add_geom(
@@ -74,23 +81,25 @@ def add_geom(
     scene.ngeom += 1
 
 
-def add_traffic(scene: mujoco.MjvScene, traffic: TrafficBoxes, step: int) -> None:
-    """Adds the background traffic of a step as boxes; people and cyclists are as tall as a person."""
+def add_traffic(scene: mujoco.MjvScene, traffic: TrafficBoxes, step: int, road: Float[np.ndarray, " O"]) -> None:
+    """Adds the background traffic of a step as boxes on the road, whose height is given; people and cyclists are as tall as a person."""
     for row in np.flatnonzero(traffic.present[step]):
         (x, y), (length, width) = traffic.position[step, row].tolist(), traffic.size[step, row].tolist()
         on_foot_or_cycle = is_person(traffic.size[step, row]) or is_cycle(traffic.size[step, row])
         height, colour = (PERSON_M, SKIN) if on_foot_or_cycle else (VEHICLE_M, GREY)
         size = (length / 2, width / 2, height / 2)
-        add_geom(scene, mujoco.mjtGeom.mjGEOM_BOX, size, (x, y, height / 2), float(traffic.yaw[step, row]), colour)
+        add_geom(scene, mujoco.mjtGeom.mjGEOM_BOX, size, (x, y, float(road[row]) + height / 2), float(traffic.yaw[step, row]), colour)
 
 
 def add_goals(
-    scene: mujoco.MjvScene, goal: Float[np.ndarray, "A 2"], opacity: Float[np.ndarray, " A"], *, radius_m: float
+    scene: mujoco.MjvScene, goal: Float[np.ndarray, "A 2"], road: Float[np.ndarray, " A"], opacity: Float[np.ndarray, " A"], *,
+    radius_m: float,
 ) -> None:  # fmt: skip
-    """Adds a flat disc of each car's colour and of the goal's radius."""
+    """Adds a flat disc of each car's colour and of the goal's radius, on the road, whose height is given."""
     for agent in np.flatnonzero(opacity > 0).tolist():
         colour = (*rgb(colour_of(agent)), float(0.45 * opacity[agent]))
-        add_geom(scene, mujoco.mjtGeom.mjGEOM_CYLINDER, (radius_m, GOAL_M / 2, 0.0), (*goal[agent].tolist(), GOAL_M / 2), 0.0, colour)
+        place = (*goal[agent].tolist(), float(road[agent]) + GOAL_M / 2)
+        add_geom(scene, mujoco.mjtGeom.mjGEOM_CYLINDER, (radius_m, GOAL_M / 2, 0.0), place, 0.0, colour)
 
 
 def add_trails(scene: mujoco.MjvScene, world: ActorTrajectories, step: int, *, trail_s: float | int) -> None:
@@ -103,11 +112,15 @@ def add_trails(scene: mujoco.MjvScene, world: ActorTrajectories, step: int, *, t
             begin, end = world.joints[here, agent, :2], world.joints[there, agent, :2]
             (dx, dy), (x, y) = end - begin, (begin + end) / 2
             size = (float(np.hypot(dx, dy)) / 2, TRAIL_HALF_M, TRAIL_M / 2)
+            height = float(world.road[[here, there], agent].mean())
             yaw, colour = float(np.arctan2(dy, dx)), (*rgb(colour_of(agent)), opacity)
-            add_geom(scene, mujoco.mjtGeom.mjGEOM_BOX, size, (x, y, TRAIL_M / 2), yaw, colour)
+            add_geom(scene, mujoco.mjtGeom.mjGEOM_BOX, size, (x, y, height + TRAIL_M / 2), yaw, colour)
 
 
-def add_controls(scene: mujoco.MjvScene, marks: ControlMarks, step: int) -> None:
-    """Adds the lights of a step and the stop signs as boxes."""
-    for place, yaw, half, rgba in control_boxes.find_boxes(marks, step):
+def add_controls(scene: mujoco.MjvScene, world: Scene, marks: ControlMarks, step: int) -> None:
+    """Adds the lights of a step and the stop signs as boxes, on the lowest level of the road."""
+    boxes = control_boxes.find_boxes(marks, step)
+    places = np.reshape([place for place, *_ in boxes], (-1, 3))
+    places[:, 2] += road_levels.measure_level(world, places[:, :2], 0)
+    for place, (_, yaw, half, rgba) in zip(places.tolist(), boxes, strict=True):
         add_geom(scene, mujoco.mjtGeom.mjGEOM_BOX, half, place, yaw, rgba)

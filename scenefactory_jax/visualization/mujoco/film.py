@@ -17,7 +17,7 @@ from jaxtyping import Float, UInt8
 from scenefactory_jax.core.schema import Bounds, Count, NonNegative
 from scenefactory_jax.dynamics.articulated.parameters import CarParameters
 from scenefactory_jax.env.rollout import Recording
-from scenefactory_jax.visualization import video_file
+from scenefactory_jax.visualization import road_levels, video_file
 from scenefactory_jax.visualization.mujoco import actors, offscreen_renderer, scene_model
 from scenefactory_jax.visualization.mujoco.actors import ActorTrajectories
 from scenefactory_jax.visualization.video_file import VideoError
@@ -102,10 +102,11 @@ def frames(
             behind = look_from_behind(world.joints[step, slot, :3], float(heading[step]), camera)
 
             def decorate(scene: mujoco.MjvScene, step: int = step) -> None:
-                actors.add_goals(scene, world.goal[step], world.opacity[step], radius_m=goal_radius_m)
+                under_goals = road_levels.measure_road(world.scene, world.goal[step], world.road[step])
+                actors.add_goals(scene, world.goal[step], under_goals, world.opacity[step], radius_m=goal_radius_m)
                 actors.add_trails(scene, world, step, trail_s=settings.trail_s)
-                actors.add_traffic(scene, world.traffic, step)
-                actors.add_controls(scene, world.marks, step)
+                actors.add_traffic(scene, world.traffic, step, world.traffic_road[step])
+                actors.add_controls(scene, world.scene, world.marks, step)
 
             views = []
             for view in {"chase": [behind], "bird": [above], "both": [behind, above]}[settings.view]:
@@ -128,7 +129,7 @@ def look_from_above(world: ActorTrajectories, *, aspect: float) -> mujoco.MjvCam
     points = np.concatenate([world.joints[world.active][:, :2], world.goal[world.active]])
     low, high = points.min(axis=0) - 12.0, points.max(axis=0) + 12.0
     view = mujoco.MjvCamera()
-    view.lookat[:2] = (low + high) / 2
+    view.lookat[:] = *((low + high) / 2), world.road[world.active].max(initial=-np.inf)
     side = max(high[1] - low[1], (high[0] - low[0]) / aspect)
     view.distance, view.azimuth, view.elevation = side / 2 / np.tan(np.radians(FOVY / 2)), 90.0, -90.0
     return view

@@ -11,17 +11,20 @@ from typing import NamedTuple
 import mujoco
 import numpy as np
 from jaxtyping import Float, Int
+from scipy.spatial.transform import Rotation
 
 from scenefactory_jax.core.types import Scene
 from scenefactory_jax.dynamics.articulated import model as models
 from scenefactory_jax.dynamics.articulated.parameters import CarParameters
+from scenefactory_jax.visualization import road_levels
 from scenefactory_jax.visualization.birds_eye.drawing import colour_of, rgb
 from scenefactory_jax.visualization.mujoco import ground_meshes
 
-GROUND, SKY, HORIZON = (0.44, 0.47, 0.41, 1.0), (0.44, 0.62, 0.84), (0.86, 0.90, 0.94)
+SKY, HORIZON = (0.44, 0.62, 0.84), (0.86, 0.90, 0.94)
 SUN = (0.45, 0.3, -1.0)  # direction of its light
 SHADOWS_M, SHADOW_PIXELS = 150.0, 8192  # radius of shadows; just beyond, MuJoCo speckles the ground
 JOINTS = 17  # of a car: 7 of the chassis; suspension, steering and spin of the front wheels; suspension and spin of the rear ones
+STEP_M = 0.5  # over which the road's slope is measured
 STEER, SPIN = np.array([8, 11]), np.array([9, 12, 14, 16])
 
 
@@ -83,6 +86,29 @@ def set_posture(
     return joints
 
 
+def stand_on_road(scene: Scene, joints: Float[np.ndarray, "*n 17"], near: Float[np.ndarray, "*n"]) -> Float[np.ndarray, "*n 17"]:
+    """Lifts and tilts level cars onto the road of the level that is nearest to a height, m."""
+    if scene.elevation is None:
+        return joints
+    stood, place = joints.copy(), joints[..., :2]
+    ahead = np.stack([STEP_M * np.eye(2)[axis] for axis in range(2)])
+    here = road_levels.measure_road(scene, place, near)
+    east, north = ((road_levels.measure_road(scene, place + step, here) - here) / STEP_M for step in ahead)
+    stood[..., 2] += here
+    # the shortest turn from the world's up to the road's, after the car's own yaw
+    tilt = Rotation.from_rotvec(_find_turns(east, north))
+    turn = tilt * Rotation.from_quat(np.roll(joints[..., 3:7].reshape(-1, 4), -1, axis=1))  # SciPy's scalar comes last
+    stood[..., 3:7] = np.roll(turn.as_quat(), 1, axis=1).reshape(*np.shape(near), 4)
+    return stood
+
+
+def _find_turns(east: Float[np.ndarray, "*n"], north: Float[np.ndarray, "*n"]) -> Float[np.ndarray, "N 3"]:
+    """Rotation vectors from the world's up to the normal of a road that rises east and north."""
+    axis = np.stack([north, -east, np.zeros_like(east)], axis=-1).reshape(-1, 3)
+    size = np.linalg.norm(axis, axis=1, keepdims=True)
+    return axis / np.maximum(size, 1e-9) * np.arctan(size)
+
+
 def place_actors(built: RenderModel, data: mujoco.MjData, joints: Float[np.ndarray, "A 17"], opacity: Float[np.ndarray, " A"]) -> None:
     """Sets joints and opacity of the present cars; both arrays hold all slots."""
     for row, slot in enumerate(built.slots):
@@ -114,7 +140,9 @@ def _empty(scene: Scene) -> mujoco.MjSpec:
     sun = model.worldbody.add_light(type=mujoco.mjtLightType.mjLIGHT_DIRECTIONAL, pos=[x, y, 0.0], dir=list(SUN))
     sun.castshadow, sun.diffuse, sun.specular = True, [0.55] * 3, [0.1] * 3
     plane = mujoco.mjtGeom.mjGEOM_PLANE
-    model.worldbody.add_geom(name="ground", type=plane, size=[0, 0, 1], rgba=list(GROUND), contype=0, conaffinity=0)
+    low = 0.0 if scene.elevation is None else float(np.min(scene.elevation.height)) - 1.0  # below the hills
+    look = {"rgba": list(ground_meshes.GROUND), "contype": 0, "conaffinity": 0}
+    model.worldbody.add_geom(name="ground", type=plane, pos=[0, 0, low], size=[0, 0, 1], **look)
     return model
 
 

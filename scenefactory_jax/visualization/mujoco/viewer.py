@@ -20,6 +20,7 @@ from scenefactory_jax.core.pytree import replace
 from scenefactory_jax.core.trajectory import TrafficBoxes
 from scenefactory_jax.core.types import Scene
 from scenefactory_jax.dynamics.articulated.parameters import CarParameters
+from scenefactory_jax.visualization import road_levels
 from scenefactory_jax.visualization.birds_eye import control_marks
 from scenefactory_jax.visualization.mujoco import actors, film, keyboard_control, scene_model
 from scenefactory_jax.visualization.mujoco.film import Camera
@@ -136,14 +137,15 @@ def _place_actors(
     """Places cars, light, traffic, traffic lights and stop signs; returns the cars' joints."""
     shot = now.shot
     assert shot is not None
-    level = scene_model.set_posture(car, np.asarray(shot.position), np.asarray(shot.yaw), np.asarray(shot.steer), spin)
-    joints = level if shot.joints is None else np.asarray(shot.joints, float)
+    joints = scene_model.set_posture(car, np.asarray(shot.position), np.asarray(shot.yaw), np.asarray(shot.steer), spin)
+    joints = scene_model.stand_on_road(scene, joints, np.asarray(shot.height)) if shot.joints is None else np.asarray(shot.joints, float)
     scene_model.place_actors(built, data, joints, np.asarray(shot.active, float))
     scene_model.place_light(data, joints[slot, :3])
     viewer.user_scn.ngeom = 0
     traffic = TrafficBoxes.from_boxes(shot.traffic)
-    actors.add_traffic(viewer.user_scn, TrafficBoxes(*(column[None] for column in traffic)), 0)
-    actors.add_controls(viewer.user_scn, control_marks.find_marks(scene, [float(shot.time_s)]), 0)
+    road = road_levels.measure_road(scene, traffic.position, np.asarray(traffic.elevation))
+    actors.add_traffic(viewer.user_scn, TrafficBoxes(*(np.asarray(column)[None] for column in traffic)), 0, road)
+    actors.add_controls(viewer.user_scn, scene, control_marks.find_marks(scene, [float(shot.time_s)]), 0)
     return joints
 
 

@@ -51,10 +51,12 @@ def _make_step_records(recording: Recording, worlds: int) -> StepRecord:
     still = np.asarray(recording.weather.film_mm)[:worlds]
     knots = zip(np.asarray(rain.time_s), np.asarray(rain.film_mm), still, strict=True)
     film = np.stack([np.interp(time, at, depth) if len(at) else np.full(len(time), now) for at, depth, now in knots])
-    traffic = unchecked(Boxes, **vars(frames.traffic), **dict.fromkeys(("elevation", "yaw_rate", "mass")))
+    cars = frames.active.shape[-1]
+    height, elevation = (None, None) if frames.height is None else np.split(np.asarray(frames.height), [cars], axis=-1)
+    traffic = unchecked(Boxes, **vars(frames.traffic), elevation=elevation, yaw_rate=None, mass=None)
     known = {"active": frames.active, "position": frames.position, "yaw": frames.yaw, "goal": frames.goal, "events": frames.events}
     known |= {"time_s": np.tile(time, (worlds, 1)), "film_mm": film, "traffic": traffic, "terms": {}}
-    known |= {"speed": np.linalg.norm(frames.velocity, axis=-1), "friction_utilization": frames.friction_utilization}
+    known |= {"height": height, "speed": np.linalg.norm(frames.velocity, axis=-1), "friction_utilization": frames.friction_utilization}
     known |= {"goal_distance": np.linalg.norm(frames.goal - frames.position, axis=-1)}
     missing = ("steer", "action", "ttc", "edge_ttc", "grip", "slip", "contact_force", "wheels", "joints")
     return unchecked(StepRecord, **known, **dict.fromkeys(missing))

@@ -12,6 +12,7 @@ from scenefactory_jax.core.types import ROAD_USERS, SURFACES, Road, Scene
 from scenefactory_jax.env.rollout import Recording, StepRecord
 from scenefactory_jax.visualization.birds_eye import patch_overlay, traffic_shapes
 from scenefactory_jax.visualization.recorded_episodes import cut_world, find_shown_steps
+from scenefactory_jax.visualization.road_levels import find_covered, list_levels
 from scenefactory_jax.visualization.road_lines import LAYERS, join_segments
 from scenefactory_jax.visualization.web.array_packing import Packer
 from scenefactory_jax.visualization.web.road_posts import RoadPosts
@@ -39,7 +40,9 @@ def world(
     scene, shots, active, hz = cut_world(recording, index)
     packer, shown = Packer(), find_shown_steps(active)
     _add_cars(packer, shots, active, shown)
-    layers, traffic = _add_road(packer, scene.road), _add_traffic(packer, scene, shots)
+    _, *higher = list_levels(scene)
+    layers, traffic = _add_road(packer, "road", [scene.road]), _add_traffic(packer, scene, shots)
+    bridges = _add_road(packer, "bridges", [level.road for level in higher]) if higher else {}
     packer.add("film", shots.film_mm[None], resolution=0.001)
     head = {
         "name": name,
@@ -52,6 +55,7 @@ def world(
         "terms": list(shots.terms),
         "wheels": list(WHEELS) if shots.wheels is not None else [],
         "layers": layers,
+        "bridges": bridges,
         "patches": [
             {"label": area.label, "colour": list(area.colour), "pieces": [_rounded(piece) for piece in area.pieces]}
             for area in patch_overlay.areas(scene.weather)
@@ -90,13 +94,15 @@ def _add_cars(packer: Packer, shots: StepRecord, active: Bool[np.ndarray, "T A"]
 
 
 def _cars(scene: Scene, shots: StepRecord, active: Bool[np.ndarray, "T A"], shown: Int[np.ndarray, "T A"]) -> list[dict[str, Any]]:
-    """Slot, size, spans of active steps, and goals with their first step, of every present car."""
-    cars = []
+    """Slot, size, spans of active steps and of those under a bridge, and goals with their first step, of every present car."""
+    height = None if shots.height is None else np.asarray(shots.height)
+    cars, covered = [], find_covered(scene, np.asarray(shots.position), height)
     for car in np.flatnonzero(np.asarray(scene.agents.present) | active.any(axis=0)).tolist():
         goal = shots.goal[shown[:, car], car]
         begins = np.flatnonzero(np.r_[True, (goal[1:] != goal[:-1]).any(axis=1)]).tolist()
         goals = [[step, *_rounded(goal[step])] for step in begins]
-        cars.append({"slot": car, "size": _rounded(scene.agents.size[car]), "spans": spans(active[:, car]), "goals": goals})
+        times = {"spans": spans(active[:, car]), "covered": spans(covered[:, car])}
+        cars.append({"slot": car, "size": _rounded(scene.agents.size[car]), **times, "goals": goals})
     return cars
 
 
@@ -126,21 +132,22 @@ def _add_traffic(packer: Packer, scene: Scene, shots: StepRecord) -> list[dict[s
     for name, column in {"x": traffic.position[..., 0], "y": traffic.position[..., 1], "yaw": traffic.yaw}.items():
         packer.add(f"traffic:{name}", np.take_along_axis(column, shown, axis=0)[:, rows].T, resolution=RESOLUTION[name])
     kinds, parked = np.asarray(scene.traffic_log.kind), traffic_shapes.find_parked(traffic)
-    logged = len(kinds) == traffic.present.shape[1]
+    logged, covered = len(kinds) == traffic.present.shape[1], find_covered(scene, traffic.position, traffic.elevation)
     return [
         {
             "size": _rounded(traffic.size[shown[0, row], row]),
             "kind": ROAD_USERS[int(kinds[row])] if logged else "vehicle",
             "spans": spans(traffic.present[:, row]),
+            "covered": spans(covered[:, row]),
             "parked": bool(parked[row]),
         }
         for row in rows
     ]
 
 
-def _add_road(packer: Packer, road: Road) -> dict[str, list[int]]:
+def _add_road(packer: Packer, name: str, roads: list[Road]) -> dict[str, list[int]]:
     """Adds the points of all lines, layer by layer, as one array; returns the number of points of each line."""
-    lines = list(join_segments(road))
-    layers = {name: [points for points, kind in lines if kind in kinds] for name, kinds in LAYERS.items()}
-    packer.add("road", np.concatenate([np.zeros((0, 2)), *itertools.chain(*layers.values())]).T, resolution=0.01)
-    return {name: [len(points) for points in layer] for name, layer in layers.items()}
+    lines = [line for road in roads for line in join_segments(road)]
+    layers = {layer: [points for points, kind in lines if kind in kinds] for layer, kinds in LAYERS.items()}
+    packer.add(name, np.concatenate([np.zeros((0, 2)), *itertools.chain(*layers.values())]).T, resolution=0.01)
+    return {layer: [len(points) for points in rows] for layer, rows in layers.items()}

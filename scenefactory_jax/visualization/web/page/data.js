@@ -10,7 +10,8 @@ async function openWorld(index) {
   if (!world.array) {
     const bytes = await inflate(packed[index].textContent);
     world.array = Object.fromEntries(Object.entries(world.arrays).map(([name, entry]) => [name, decode(entry, bytes)]));
-    world.road = roadLines(world);
+    world.road = roadLines(world.array.road, world.layers);
+    world.bridge = roadLines(world.array.bridges, world.bridges);
     world.bySlot = new Map(world.cars.map((car) => [car.slot, car]));
     world.end = world.steps - 1;
   }
@@ -38,15 +39,15 @@ function decode({ shape: [rows, columns], low, step, at }, bytes) {
 }
 
 /** Layer -> lines, each a flat list x, y, x, y. */
-function roadLines(world) {
-  const { columns, values } = world.array.road;
+function roadLines(array, layers) {
+  const { columns, values } = array ?? { columns: 0, values: [] };
   let next = 0;
   const line = (count) => {
     const points = Array.from({ length: count }, (_, i) => [values[next + i], values[columns + next + i]]);
     next += count;
     return points.flat();
   };
-  return Object.fromEntries(Object.entries(world.layers).map(([name, counts]) => [name, counts.map(line)]));
+  return Object.fromEntries(Object.entries(layers).map(([name, counts]) => [name, counts.map(line)]));
 }
 
 // ---- values of a world

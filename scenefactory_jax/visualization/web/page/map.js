@@ -6,9 +6,9 @@ const pen = canvas.getContext("2d");
 
 // from bottom to top; in metres, or in pixels of the screen
 const LAYERS = [
-  { inMetres: true, draws: [drawRoad, drawLights, drawSigns, drawTraffic, drawGoals] },
+  { inMetres: true, draws: [drawRoad, drawLights, drawSigns, drawCovered, drawBridges, () => drawTraffic(), drawGoals] },
   { inMetres: false, draws: [drawGoalLabels] },
-  { inMetres: true, draws: [drawTrails, drawCars] },
+  { inMetres: true, draws: [drawTrails, () => drawCars()] },
   { inMetres: false, draws: [drawCarLabels, drawEvents] },
 ];
 
@@ -85,11 +85,18 @@ function rimmedText(brush, text, left, top, { font, rim, colour, rimWidth }) {
 
 // ---- traffic
 
-function drawTraffic() {
+/** What is under a bridge, which is drawn over it. */
+function drawCovered() {
+  if (!bridges) return;
+  drawTraffic(true);
+  drawCars(true);
+}
+
+function drawTraffic(covered = false) {
   pen.strokeStyle = css("outline");
   pen.lineWidth = metres(0.06, 0.6);
   app.world.traffic.forEach((user, row) => {
-    if (!within(user.spans, now())) return;
+    if (!within(user.spans, now()) || within(user.covered, now()) !== covered) return;
     const { x, y, yaw } = pose(app.world, "traffic:", row, app.time);
     pen.fillStyle = css(user.parked && user.kind === "vehicle" ? "parked" : "traffic");
     placed(x, y, yaw, () => {
@@ -163,8 +170,8 @@ function strokeTrajectory(slot, from, to) {
 
 // ---- cars
 
-function drawCars() {
-  app.world.cars.forEach(drawCar);
+function drawCars(covered = false) {
+  for (const car of app.world.cars) if (within(car.covered, now()) === covered) drawCar(car);
 }
 
 function drawCar(car) {

@@ -13,14 +13,21 @@ const LINES = {
   yellow: ["yellow", 0.18, 1, []],
   edge: ["kerb", 0.3, 1.3, []],
 };
+const PAINT = ["bump", "white-broken", "white", "yellow-broken", "yellow", "edge"];
 const LIGHT_COLOURS = { go: "#16a34a", caution: "#f0a202", stop: "#dc2433", unknown: "#9aa1a9" };
 let paths = {}; // of this world, in metres
+let bridges = null; // the same of its bridges
 
 function preparePaths(world) {
-  paths = Object.fromEntries(Object.entries(world.road).map(([name, lines]) => [name, pathOf(lines)]));
-  paths.casing = paths.centre = paths.lane;
+  paths = pathsOf(world.road);
+  bridges = world.bridge.lane ? pathsOf(world.bridge) : null;
   paths.zebras = world.road.crosswalk.filter((line) => line.length >= 8).map(zebra);
   paths.patches = world.patches.map(({ pieces, colour }) => ({ path: pathOf(pieces.map(counterClockwise), true), colour }));
+}
+
+function pathsOf(road) {
+  const found = Object.fromEntries(Object.entries(road).map(([name, lines]) => [name, pathOf(lines)]));
+  return { ...found, casing: found.lane, centre: found.lane };
 }
 
 function pathOf(lines, closed = false) {
@@ -54,26 +61,30 @@ function zebra(line) {
   return { outline: pathOf([line], true), axis: pathOf([[x - dx, y - dy, x + dx, y + dy]]) };
 }
 
-function stroke(name) {
+function stroke(name, from = paths) {
   const [colour, width, minimum, dashes] = LINES[name];
   pen.strokeStyle = css(colour);
   pen.lineWidth = metres(width, minimum);
   pen.setLineDash(dashes);
-  pen.lineCap = dashes.length ? "butt" : "round";
-  pen.stroke(paths[name]);
+  pen.lineCap = dashes.length || from !== paths ? "butt" : "round"; // a bridge goes on as the road
+  pen.stroke(from[name]);
 }
 
 function drawRoad() {
   pen.fillStyle = css("driveway");
   pen.fill(paths.driveway);
-  ["casing", "lane", "bike"].forEach(stroke);
+  ["casing", "lane", "bike"].forEach((name) => stroke(name));
   for (const { path, colour } of paths.patches) {
     pen.fillStyle = rgb(colour, dark.matches ? 0.42 : 0.72);
     pen.fill(path);
   }
   if (app.view.scale > 2) paths.zebras.forEach(drawZebra);
   if (app.view.scale > 7) stroke("centre");
-  ["bump", "white-broken", "white", "yellow-broken", "yellow", "edge"].forEach(stroke);
+  PAINT.forEach((name) => stroke(name));
+}
+
+function drawBridges() {
+  if (bridges) ["casing", "lane", "bike", ...PAINT].forEach((name) => stroke(name, bridges));
 }
 
 function drawZebra({ outline, axis }) {
