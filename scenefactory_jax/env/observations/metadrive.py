@@ -54,7 +54,7 @@ def metadrive(
     throttle, steer, brake = state.previous_action.T
     ego = [_centre(turned / jnp.pi), speed, _centre(motion.steer / max_steer_rad), _centre(steer), _centre(throttle - brake)]
     ego += [jnp.abs(motion.yaw_rate) / max_yaw_rate_radps]
-    edges = gather_nearest(scene.edges, position, motion.yaw, count=edge_segments, range_m=range_m)
+    edges = gather_nearest(scene.edges, position, motion.yaw, count=edge_segments, range_m=range_m)[:4]  # of all levels
     side_directions = make_ray_directions(side_rays) if side_rays else jnp.array([[0.0, 1.0], [0.0, -1.0]])
     sides = cast_to_segments(side_directions, *edges, range_m=range_m) / range_m
     lane = [_centre(2 * lateral / lane_width_m)]
