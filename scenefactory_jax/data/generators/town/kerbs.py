@@ -29,15 +29,18 @@ def boundary(
     rings = [part.exterior for part in solid] + [ring for ring in gaps if shapely.Polygon(ring).area > block_m2]
     island_rings = [ring for ring in gaps if shapely.Polygon(ring).area <= block_m2]
     island_rings += [orient(island, -1.0).exterior for island in network.islands]
-    outer, inner = ([piece for ring in group for piece in _cut_ring(ring, reach, spacing_m)] for group in (rings, island_rings))
+    open_ends = shapely.union_all(network.open_ends)
+    outer, inner = ([piece for ring in group for piece in _cut_ring(ring, reach, spacing_m, open_ends)] for group in (rings, island_rings))
     surface = shapely.difference(shapely.MultiPolygon(solid), shapely.union_all(network.islands))
     return outer, inner, surface
 
 
-def _cut_ring(ring: shapely.LinearRing, reach: float, spacing: float) -> list[Points]:
-    """Cuts the parts of a ring within the square, simplified, in segments no longer than `spacing`."""
+def _cut_ring(ring: shapely.LinearRing, reach: float, spacing: float, open_ends: shapely.Geometry) -> list[Points]:
+    """Cuts the parts of a ring within the square and outside of open ends, simplified, in segments no longer than `spacing`."""
     line = shapely.LineString(ring).simplify(SIMPLIFY_M)
     within = shapely.clip_by_rect(line, -reach, -reach, reach, reach)
+    if not open_ends.is_empty:
+        within = shapely.difference(within, open_ends)
     if within.geom_type == "MultiLineString":
         within = shapely.line_merge(within)
     parts = [part for part in getattr(within, "geoms", [within]) if part.geom_type == "LineString" and part.length > MIN_EDGE_M]
