@@ -9,11 +9,12 @@ from typing import Annotated
 
 import numpy as np
 import shapely
+from jaxtyping import Int
 
 from scenefactory_jax.core.schema import Bounds, ConfigError, Fraction, Positive, Range
 from scenefactory_jax.data.generators.curves import heading
 from scenefactory_jax.data.generators.town.road_network import Place, Street
-from scenefactory_jax.data.generators.town.street_plan import Classes, Edge, Node, Plan, draw_street
+from scenefactory_jax.data.generators.town.street_plan import Classes, Edge, Node, NodeKind, Plan, draw_street
 
 BLOCKS = {
     "S": "straight",
@@ -29,6 +30,7 @@ BLOCKS = {
 }
 JUNCTIONS, LANE_BLOCKS = "XTOP", "rRyY"  # places where roads meet; blocks that begin and end on roads of their own
 APPROACH = "-"  # a straight road that is no block of the sequence
+NODES: dict[str, NodeKind] = {"X": "junction", "T": "junction", "O": "roundabout", "P": "driveway"}
 WAYS = {"X": (0.0, 90.0, -90.0), "O": (0.0, 90.0, -90.0), "P": (0.0,)}  # on from a junction, degrees to the left
 T_WAYS = ((0.0, 90.0), (0.0, -90.0), (90.0, -90.0))
 MAX_LANES, MAX_RING_LANES = 4, 2  # of a direction; where it meets a roundabout
@@ -73,7 +75,9 @@ def draw_blocks(rng: np.random.Generator, blocks: str | list[str] | int, index: 
     if isinstance(blocks, int):
         if blocks < 1:
             raise ConfigError(f"generate.blocks: expected one block or more, got {blocks}")
-        return "".join(rng.choice(list(BLOCKS), blocks))
+        while not _fit_lanes(letters := "".join(rng.choice(list(BLOCKS), blocks))):
+            pass
+        return letters
     letters = blocks if isinstance(blocks, str) else blocks[index % len(blocks)] if blocks else ""
     check_blocks(letters)
     return letters
@@ -111,18 +115,27 @@ def _pair(pieces: str) -> list[tuple[str, str]]:
     return [(piece, following if following in JUNCTIONS else "") for piece, following in roads if piece not in JUNCTIONS]
 
 
+def _count_changes(pieces: str) -> Int[np.ndarray, " P"]:
+    """Computes how many lanes more than at the start there are before each piece, and behind the last one."""
+    return np.cumsum([0, *({"y": -1, "Y": 1}.get(piece, 0) for piece in pieces)])
+
+
+def _fit_lanes(blocks: str) -> list[int]:
+    """Lists the lanes per direction that a sequence can start with."""
+    changes = _count_changes(blocks)
+    most = np.array([*(MAX_RING_LANES if block == "O" else MAX_LANES for block in blocks), MAX_LANES])
+    return [lanes for lanes in range(1, MAX_LANES + 1) if ((lanes + changes >= 1) & (lanes + changes <= most)).all()]
+
+
 def _draw_lanes(rng: np.random.Generator, blocks: str, pieces: str, numbers: ChainNumbers) -> list[int]:
     """Draws the lanes per direction at the start of every road."""
-    changes = np.cumsum([0, *({"y": -1, "Y": 1}.get(piece, 0) for piece in pieces)])
-    at_ring = np.array([piece == "O" for piece in pieces])
-    most = np.where(at_ring, MAX_RING_LANES, MAX_LANES)
-    fits = [n for n in range(1, MAX_LANES + 1) if (n + changes >= 1).all() and n + changes[-1] <= MAX_LANES and (n + changes[:-1] <= most).all()]
+    fits = _fit_lanes(blocks)
     if not fits:
         limits = f"1 to {MAX_LANES} lanes, at roundabouts {MAX_RING_LANES} at most"
         raise ConfigError(f"generate.blocks: expected changes of lanes (y, Y) that leave {limits}, got {blocks!r}")
-    wanted = [count for count in fits if numbers.lanes[0] <= count <= numbers.lanes[1]] or fits
-    start = int(rng.choice(wanted))
-    return [start + int(change) for piece, change in zip(pieces, changes, strict=False) if piece not in JUNCTIONS]
+    start = int(rng.choice([count for count in fits if numbers.lanes[0] <= count <= numbers.lanes[1]] or fits))
+    changes = _count_changes(pieces)[:-1].tolist()
+    return [start + change for piece, change in zip(pieces, changes, strict=True) if piece not in JUNCTIONS]
 
 
 class _Layout:
@@ -157,7 +170,7 @@ class _Layout:
             length = {"S": numbers.straight_m, APPROACH: numbers.arm_m}.get(piece, numbers.lane_block_m)
             end = self.place + (before + rng.uniform(*length) + after) * heading(self.yaw)
         ramp = {"r": "joins", "R": "leaves"}.get(piece, "")
-        kind = {"X": "junction", "T": "junction", "O": "roundabout", "P": "driveway", "": "joint" if self.lanes else "end"}[junction]
+        kind = NODES[junction] if junction else "joint" if self.lanes else "end"
         middle = self.place + (0.3 if ramp == "joins" else 0.7) * (end - self.place)
         self.place = end
         edge = self._connect(self.node, Node(kind, end), street, via, ramp)
@@ -179,7 +192,7 @@ class _Layout:
 
     def _take(self, ground: shapely.Geometry, nodes: set[int], earlier: list[tuple[shapely.Geometry, set[int]]] | None = None) -> bool:
         """Takes ground that is free of earlier ground, apart from what meets it at a node."""
-        if any(not nodes & others and ground.intersects(other) for other, others in (self.taken if earlier is None else earlier)):
+        if any(not nodes & others and shapely.intersects(ground, other) for other, others in (self.taken if earlier is None else earlier)):
             return False
         self.taken.append((ground, nodes))
         return True

@@ -9,6 +9,7 @@ from scenefactory_jax.data.generators.town.road_network import Network
 
 SIMPLIFY_M = 0.03  # maximum distance of a simplified edge from the boundary
 MIN_EDGE_M = 1.0
+SAME_M = 1e-3  # points of a cut edge that are closer are one
 
 
 def boundary(
@@ -39,8 +40,8 @@ def _cut_ring(ring: shapely.LinearRing, reach: float, spacing: float, open_ends:
     """Cuts the parts of a ring within the square and outside of open ends, simplified, in segments no longer than `spacing`."""
     line = shapely.LineString(ring).simplify(SIMPLIFY_M)
     within = shapely.clip_by_rect(line, -reach, -reach, reach, reach)
-    if not open_ends.is_empty:
-        within = shapely.difference(within, open_ends)
+    if not shapely.is_empty(open_ends):
+        within = shapely.simplify(shapely.difference(within, open_ends), SAME_M)
     if within.geom_type == "MultiLineString":
         within = shapely.line_merge(within)
     parts = [part for part in getattr(within, "geoms", [within]) if part.geom_type == "LineString" and part.length > MIN_EDGE_M]

@@ -8,21 +8,25 @@ from jaxtyping import Float
 
 from scenefactory_jax.core.raw_scene import Polyline, RawScene
 from scenefactory_jax.core.schema import Bounds, NonNegative
-from scenefactory_jax.core.types import DRIVABLE, LANE_BIKE
+from scenefactory_jax.core.types import DRIVABLE, EDGES, LANE_BIKE, LINES
+from scenefactory_jax.data.generators.curves import resample
+
+PositiveRange = Annotated[tuple[float, float], Bounds(above=0, is_range=True)]
 
 
 @dataclass(frozen=True)
 class MapRecording:
     """The key `recording` of `scenes.generate`; traffic and lights are the same with and without it."""
 
-    lane_m: Annotated[tuple[float, float], Bounds(above=0, is_range=True)]  # of a piece of a lane, drawn evenly in its logarithm
+    lane_m: PositiveRange  # of a piece of a lane, drawn evenly in its logarithm
+    spacing_m: PositiveRange  # between the points of a lane, a line or an edge, drawn for each
     round_m: NonNegative  # of the coordinates of all points of the map; 0: not rounded
 
 
 def record_map(raw: RawScene, rng: np.random.Generator, recording: MapRecording) -> RawScene:
-    """Cuts the lanes of a scene whose ids are their places in `roads`, and rounds all points; lanes side by side are cut at the same share."""
+    """Cuts the lanes of a scene, spaces points and rounds them; lanes side by side are cut at the same fractions of their lengths."""
     lanes = {road.id: road for road in raw.roads if road.kind in (*DRIVABLE, LANE_BIKE)}
-    cuts: dict[int, Float[np.ndarray, " K"]] = {}  # shares of the length at which a lane begins and ends
+    cuts: dict[int, Float[np.ndarray, " K"]] = {}  # fractions of the length at which a lane begins and ends
     for number in lanes:
         if number not in cuts:
             cuts |= dict.fromkeys(_find_abreast(lanes, number), _draw_cuts(rng, lanes[number].xyz, recording.lane_m))
@@ -42,9 +46,15 @@ def record_map(raw: RawScene, rng: np.random.Generator, recording: MapRecording)
     rest = [road for road in raw.roads if road.id not in lanes]
     rest = [replace(road, id=len(pieces) + i, lanes=tuple(first[lane] for lane in road.lanes)) for i, road in enumerate(rest)]
     lights = tuple(replace(light, lane=first[light.lane]) for light in raw.lights)
-    unit = recording.round_m
-    roads = tuple(replace(road, xyz=np.round(road.xyz / unit) * unit) if unit else road for road in (*pieces, *rest))
-    return replace(raw, roads=roads, lights=lights)
+    return replace(raw, roads=tuple(_record_points(rng, road, recording) for road in (*pieces, *rest)), lights=lights)
+
+
+def _record_points(rng: np.random.Generator, road: Polyline, recording: MapRecording) -> Polyline:
+    """Spaces the points of a lane, a line or an edge anew, and rounds those of any element, which lies on flat ground."""
+    xy, unit = road.xyz[:, :2], recording.round_m
+    if road.kind in (*DRIVABLE, LANE_BIKE, *LINES, *EDGES):
+        xy = resample(xy, float(rng.uniform(*recording.spacing_m)))
+    return replace(road, xyz=np.pad(np.round(xy / unit) * unit if unit else xy, ((0, 0), (0, 1))))
 
 
 def _find_abreast(lanes: dict[int, Polyline], start: int) -> list[int]:

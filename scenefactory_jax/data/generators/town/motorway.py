@@ -75,7 +75,15 @@ class Meeting(NamedTuple):
 
 
 def add_ramp(
-    network: Network, meeting: Meeting, street: Street, dimensions: RoadDimensions, *, length: float, turn: float, radius: float, limit: float
+    network: Network,
+    meeting: Meeting,
+    street: Street,
+    dimensions: RoadDimensions,
+    *,
+    length: float,
+    turn: float,  # away from the carriageway
+    radius: float,
+    limit: float,
 ) -> Curve:
     """Builds the lane of a ramp and returns its curve from the carriageway outward; both kinds bend to the right of the carriageway."""
     lane, place, out, joins = meeting

@@ -119,9 +119,9 @@ class Network:
     def leave_open(self, place: Place, yaw: float, half_width: float) -> None:
         """Paves the ground behind the end of a road, so that cars leave it without meeting a kerb."""
         ahead, left = heading(yaw), heading(yaw + np.pi / 2)
-        ground = lambda far, half: shapely.Polygon([place + x * ahead + y * left for x, y in ((0, -half), (far, -half), (far, half), (0, half))])  # noqa: E731
-        self.areas.append(ground(OPEN_M, half_width))
-        self.open_ends.append(ground(OPEN_M + 1.0, half_width + 3.0))
+        for ground, far, half in ((self.areas, OPEN_M, half_width), (self.open_ends, OPEN_M + 1.0, half_width + 3.0)):
+            corners = ((0.0, -half), (far, -half), (far, half), (0.0, half))
+            ground.append(shapely.Polygon([place + x * ahead + y * left for x, y in corners]))
 
     def link(self, lane: int, follower: int) -> None:
         """Leads a lane into another."""

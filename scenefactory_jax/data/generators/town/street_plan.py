@@ -36,13 +36,16 @@ class StreetClass:
 Classes = Mapping[int, StreetClass]  # by rank
 
 
+NodeKind = Literal["junction", "roundabout", "outlet", "driveway", "lot", "joint", "end"]
+
+
 class Node(NamedTuple):
     """A junction, a driveway, a parking lot, or a place outside of the town to which a street leads.
 
     Of a sequence of blocks, too: the place where one road goes on as another, and an end where nothing more is drawn.
     """
 
-    kind: Literal["junction", "roundabout", "outlet", "driveway", "lot", "joint", "end"]
+    kind: NodeKind
     place: Place
 
 

@@ -12,23 +12,26 @@ from jaxtyping import Float
 from scenefactory_jax.core.instantiate import instantiate
 from scenefactory_jax.core.raw_scene import Light, Polyline, RawScene, SceneError, Track
 from scenefactory_jax.core.scene_arrays import wrap_angles
-from scenefactory_jax.core.schema import ConfigError, Fraction, NonNegative, Positive, check_names
+from scenefactory_jax.core.schema import ConfigError, Fraction, NonNegative, Positive
 from scenefactory_jax.core.types import CROSSWALK, DRIVEWAY, EDGE_BOUNDARY, EDGE_MEDIAN, STOP_SIGN
 from scenefactory_jax.data.generators.curves import Points, heading, resample
+from scenefactory_jax.data.generators.town import settings
 from scenefactory_jax.data.generators.town.block_sequence import draw_blocks
 from scenefactory_jax.data.generators.town.hills import Hills, add_hills
 from scenefactory_jax.data.generators.town.map_recording import MapRecording, record_map
 from scenefactory_jax.data.generators.town.road_network import Network
 from scenefactory_jax.data.generators.town.road_users import TownUser
-from scenefactory_jax.data.generators.town.settings import DifficultyEnds, Variant, draw_variant, interpolate, overlay
+from scenefactory_jax.data.generators.town.settings import DifficultyEnds, Variant
 from scenefactory_jax.data.generators.town.traffic import add_warmup
 from scenefactory_jax.data.generators.town.traffic_lights import Gates
 
 PACKAGE = "scenefactory_jax.data.generators.town"
 MODULES = {"network": "build_network"}  # of entries whose module has another name
+BEYOND_M = 10.0  # around a road of blocks, in which nothing of it is cut off
 MAX_REDRAWS = 40  # towns that are drawn until one can be built and has enough moving cars
 MAX_TRAFFIC_REDRAWS = 3  # on one network
-HILLS, RECORDING, VARIANT, BLOCKS = 0x68696C6C, 0x6D6170, 0x766172, 0x626C6B  # of seeds of their own: a town is the same with and without hills
+# of seeds of their own, so that a town is the same with and without hills
+HILLS, RECORDING, VARIANT, BLOCKS = 0x68696C6C, 0x6D6170, 0x766172, 0x626C6B
 
 
 class Log(NamedTuple):
@@ -93,35 +96,23 @@ def generate(
         raise ConfigError(f"generate: expected seed and index >= 0, got {seed} and {index}")
     if not 0 <= log_current < log_steps - 1:
         raise ConfigError(f"generate.log_current: expected 0 .. log_steps - 2 = {log_steps - 2}, got {log_current}")
+    draw = lambda *more: np.random.default_rng(np.random.SeedSequence((seed, index, *more)))  # noqa: E731
     entries = {"network": network, "kerbs": kerbs, "driveways": driveways, "traffic_lights": traffic_lights, "traffic": traffic}
-    if variants:
-        entries = _change(entries, draw_variant(np.random.default_rng(np.random.SeedSequence((seed, index, VARIANT))), variants))
-    if difficulty is not None:
-        if difficulty_ends is None:
-            raise ConfigError(f"generate.difficulty: expected null where generate.difficulty_ends is null, got {difficulty:g}")
-        entries = _change(entries, interpolate(difficulty_ends, difficulty))
+    entries = settings.change(entries, draw(VARIANT), variants, difficulty, difficulty_ends)
     parts = [instantiate(entry, builtins=f"{PACKAGE}.{MODULES.get(key, key)}", where=f"generate.{key}") for key, entry in entries.items()]
+    if blocks is not None:
+        parts[0] = functools.partial(parts[0], sequence=draw_blocks(draw(BLOCKS), blocks, index))
     times, travel, cars = log_dt * np.arange(log_steps), entries["traffic"]["travel_m"][0], entries["traffic"]["cars"][0]
     log = Log(times, log_current, warmup_s, max_sdc_distance_m, sensor_range_m, travel, cars)
     kind = kinds[index % len(kinds)] if kinds else None
-    if blocks is not None:
-        letters = draw_blocks(np.random.default_rng(np.random.SeedSequence((seed, index, BLOCKS))), blocks, index)
-        parts[0] = functools.partial(parts[0], sequence=letters)
     for redraw in range(MAX_REDRAWS):
-        rng = np.random.default_rng(np.random.SeedSequence((seed, index, redraw)))
-        scene = _draw_scene(rng, kind, reach_m, parts, log, lane_spacing_m, line_spacing_m)
+        scene = _draw_scene(draw(redraw), kind, reach_m, parts, log, lane_spacing_m, line_spacing_m)
         if scene is not None:
-            seeds = lambda use, redraw=redraw: np.random.default_rng(np.random.SeedSequence((seed, index, redraw, use)))  # noqa: E731
             name, source = f"{scene.name}-{seed}-{index:06d}", f"generator, seed {seed}, index {index}"
-            scene = scene if recording is None else record_map(scene, seeds(RECORDING), recording)
-            scene = scene if hills is None else add_hills(scene, seeds(HILLS), hills)
+            scene = scene if recording is None else record_map(scene, draw(redraw, RECORDING), recording)
+            scene = scene if hills is None else add_hills(scene, draw(redraw, HILLS), hills)
             return replace(scene, name=name, source=source, metadata=scene.metadata | {"seed": seed, "index": index})
     raise SceneError(f"generate.traffic.cars: {MAX_REDRAWS} towns had fewer than {log.min_cars} moving cars; give a lower minimum")
-
-
-def _change(entries: dict[str, Mapping[str, Any]], changes: Mapping[str, Any]) -> dict[str, Mapping[str, Any]]:
-    check_names(changes, list(entries), where="generate, changes of a variant or a difficulty", required=[])
-    return overlay(entries, changes)
 
 
 def _draw_scene(
@@ -140,7 +131,7 @@ def _draw_scene(
         return None
     kind, network = drawn
     if network.open_ends:  # a road of blocks is as long as it is
-        reach = max(reach, float(np.abs(shapely.total_bounds(network.open_ends)).max()))
+        reach = max(reach, float(np.abs(shapely.total_bounds(network.areas)).max()) + BEYOND_M)
     outer, islands, surface = compute_kerbs(network, reach)
     pavements = [] if kind == "motorway" else outer
     driveways, spots = draw_driveways(rng, network, pavements, surface)
