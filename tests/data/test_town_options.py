@@ -91,6 +91,19 @@ def test_harder_towns_have_more_traffic():
     assert count(1.0) > 2 * count(0.0)
 
 
+@pytest.mark.parametrize("option", ["town", "streets", "blocks", "town_womd"])
+def test_variants_and_ends_of_the_options_change_only_what_a_town_has(option):
+    entry = hydra_config.load_config("scenes", f"scenes={option}")["scenes"]["generate"]
+    entries = {key: entry[key] for key in ("network", "kerbs", "driveways", "traffic_lights", "traffic")}
+    ends = schema.read(entry["difficulty_ends"], settings.DifficultyEnds)
+    for variant in ({}, *(one["changes"] for one in (entry["variants"] or {}).values())):
+        for difficulty in (None, 0.0, 1.0):
+            changes = {"one": settings.Variant(1.0, variant)}
+            changed = settings.change(entries, np.random.default_rng(0), changes, difficulty, ends)
+            for key, value in changed.items():
+                instantiate(value, builtins=f"{town_scene.PACKAGE}.{town_scene.MODULES.get(key, key)}", where=key)
+
+
 def test_a_variant_is_one_of_those_given():
     cars = lambda count: {"traffic": {"cars": [count, count]}}  # noqa: E731
     entry = {name: settings.Variant(weight, cars(n)) for name, weight, n in (("few", 3.0, 3), ("many", 1.0, 30))}
