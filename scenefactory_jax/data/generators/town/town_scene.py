@@ -74,8 +74,7 @@ def generate(
 ) -> RawScene:
     """Generates scene `index` of the series `seed`: a road network, traffic lights and simulated traffic.
 
-    The scene depends on seed, index and numbers alone. Coordinates are metres around the middle of the town; `sdc` is a moving car near it.
-    The numbers are described in `conf/scenes/town.yaml`.
+    The scene depends on seed, index and numbers alone, described in `conf/scenes/town.yaml`. Coordinates are metres around the middle.
 
     Args:
         network: entry of the roads, `(rng, reach, kind) -> (kind, Network)`, or None if the drawn plan cannot be built.
@@ -84,9 +83,8 @@ def generate(
         traffic_lights: entry of the lights, `(rng, network, times) -> Gates`.
         traffic: entry of the road users, `(rng, network, kerbs, surface, reach, times, gates) -> users`, with `cars` and `travel_m`.
         variants: kinds of towns of which each scene is one; their changes are those of the five entries, as are those of `difficulty_ends`.
-        blocks: letters of the blocks of a road in their order, such as "SCXOT" (`block_sequence.BLOCKS`); several such texts that take
-            turns; or a number of blocks that are drawn. null: towns.
-        difficulty: from 0 to 1, where the numbers lie between those of `difficulty_ends`; null: the entries as they are.
+        blocks: letters of the blocks of a road (`block_sequence.BLOCKS`); several such texts that take turns; a number of drawn blocks.
+        difficulty: where the numbers lie between those of `difficulty_ends`; None: the entries as they are.
 
     Raises:
         ConfigError: an unknown key or a number out of range.
@@ -104,9 +102,8 @@ def generate(
         parts[0] = functools.partial(parts[0], sequence=draw_blocks(draw(BLOCKS), blocks, index))
     times, travel, cars = log_dt * np.arange(log_steps), entries["traffic"]["travel_m"][0], entries["traffic"]["cars"][0]
     log = Log(times, log_current, warmup_s, max_sdc_distance_m, sensor_range_m, travel, cars)
-    kind = kinds[index % len(kinds)] if kinds else None
     for redraw in range(MAX_REDRAWS):
-        scene = _draw_scene(draw(redraw), kind, reach_m, parts, log, lane_spacing_m, line_spacing_m)
+        scene = _draw_scene(draw(redraw), kinds[index % len(kinds)] if kinds else None, reach_m, parts, log, lane_spacing_m, line_spacing_m)
         if scene is not None:
             name, source = f"{scene.name}-{seed}-{index:06d}", f"generator, seed {seed}, index {index}"
             scene = scene if recording is None else record_map(scene, draw(redraw, RECORDING), recording)
