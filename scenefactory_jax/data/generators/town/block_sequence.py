@@ -171,7 +171,7 @@ class _Layout:
             end = self.place + (before + rng.uniform(*length) + after) * heading(self.yaw)
         ramp = {"r": "joins", "R": "leaves"}.get(piece, "")
         kind = NODES[junction] if junction else "joint" if self.lanes else "end"
-        middle = self.place + (0.3 if ramp == "joins" else 0.7) * (end - self.place)
+        middle = (self.place + end) / 2
         self.place = end
         edge = self._connect(self.node, Node(kind, end), street, via, ramp)
         if edge is None:

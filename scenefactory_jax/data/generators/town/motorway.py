@@ -111,9 +111,8 @@ def build_with_ramp(
     auxiliary: float,
     **ramp: float,
 ) -> Carriageway:
-    """Builds one direction of a road with a ramp, whose other end stays open; `ramp`: see `add_ramp`."""
-    lengths, count = replace(dimensions, bay_m=auxiliary, hold_m=auxiliary), len(curve[0])
-    meet = round((0.3 if joins else 0.7) * count)
+    """Builds one direction of a road with a ramp at its middle, whose other end stays open; `ramp`: see `add_ramp`."""
+    lengths, meet = replace(dimensions, bay_m=auxiliary, hold_m=auxiliary), len(curve[0]) // 2
     ways, (meeting,) = _build_carriageway(
         network, curve, street._replace(lanes=before), lengths, meet if joins else None, None if joins else meet
     )
