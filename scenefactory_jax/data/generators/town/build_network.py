@@ -1,8 +1,9 @@
 """Draws the road network of a town: a motorway, or streets with a block for every node of a plan and a road for every edge."""
 
+import functools
 import itertools
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -10,9 +11,11 @@ import numpy as np
 from scenefactory_jax.core.instantiate import instantiate
 from scenefactory_jax.core.schema import ConfigError, Fraction
 from scenefactory_jax.data.generators.curves import heading
+from scenefactory_jax.data.generators.town.block_sequence import ChainNumbers, draw_chain
 from scenefactory_jax.data.generators.town.intersections import OPPOSITE, Arm, Control, turn_angle
+from scenefactory_jax.data.generators.town.motorway import build_with_ramp
 from scenefactory_jax.data.generators.town.road_network import BROKEN_YELLOW, Network, Port, Pose, Street
-from scenefactory_jax.data.generators.town.road_segments import RoadDimensions, connect_ports
+from scenefactory_jax.data.generators.town.road_segments import Carriageway, RoadDimensions, connect_ports
 from scenefactory_jax.data.generators.town.street_plan import Edge, Plan, StreetClass
 
 PACKAGE = "scenefactory_jax.data.generators.town"
@@ -52,6 +55,7 @@ def draw_network(
     rng: np.random.Generator,
     reach: float,
     kind: str | None,
+    sequence: str | None = None,
     *,
     plans: dict[str, Mapping[str, Any] | None],
     motorway: Mapping[str, Any],
@@ -62,11 +66,13 @@ def draw_network(
     roads: RoadDimensions,
     junctions: JunctionNumbers,
     blocks: Blocks,
+    chain: ChainNumbers | None = None,  # runs of before have none
 ) -> tuple[str, Network] | None:
     """Draws a network and returns its kind with it; None if the drawn plan cannot be built.
 
     Args:
         kind: name of a plan, or "motorway"; None: drawn.
+        sequence: letters of the blocks of a road, which is then drawn in place of a plan; the kind is the sequence.
         plans: entries of `(rng, reach, classes) -> Plan`, or None.
         motorway: entry of `(rng) -> Network`.
         lots: entry of `(rng, plan, reach, street) -> Plan`.
@@ -85,39 +91,70 @@ def draw_network(
         for name, entry in vars(blocks).items()
     }
     add_lots, build_motorway = make(lots, "street_plan", "lots"), make(motorway, "motorway", "motorway")
+    lane = Street(1, driveway["lane_width_m"], 0.0, driveway["speed_limit_mps"], 0, 0.0, 0.0, BROKEN_YELLOW)
+    if sequence is not None:
+        if chain is None:
+            raise ConfigError(f"{WHERE}.chain: missing; generate.blocks={sequence} needs it")
+        plain = replace(junctions, roundabout_fraction=0.0, bay_fraction=0.0, drop_fraction=0.0)  # each block as its letter says
+        plan = draw_chain(rng, sequence, classes, lane, chain)
+        network = build_network(rng, plan, builders, roads, plain, functools.partial(_draw_ramp, chain))
+        return None if network is None else (sequence, network)
     if kind == "motorway" or (kind is None and rng.random() < motorway_fraction):
         return "motorway", build_motorway(rng)
     kind = kind or str(rng.choice(names))
-    lane = Street(1, driveway["lane_width_m"], 0.0, driveway["speed_limit_mps"], 0, 0.0, 0.0, BROKEN_YELLOW)
     plan = layouts[kind](rng, reach, classes)
     network = None if plan is None else build_network(rng, add_lots(rng, plan, reach, lane), builders, roads, junctions)
     return None if network is None else (kind, network)
 
 
+def _draw_ramp(numbers: ChainNumbers, rng: np.random.Generator, way: str) -> Callable[..., Carriageway]:
+    """Draws the dimensions of a ramp and returns the builder of a direction of a road with it."""
+    length, auxiliary, turn = (float(rng.uniform(*span)) for span in (numbers.ramp_m, numbers.auxiliary_m, numbers.ramp_turn_deg))
+    dimensions = {"length": length, "auxiliary": auxiliary, "turn": float(np.radians(turn)), "radius": numbers.ramp_radius_m}
+    return functools.partial(build_with_ramp, joins=way == "joins", **dimensions)
+
+
 def build_network(
-    rng: np.random.Generator, plan: Plan, builders: dict[str, Callable[..., list[Port]]], roads: RoadDimensions, junctions: JunctionNumbers
+    rng: np.random.Generator,
+    plan: Plan,
+    builders: dict[str, Callable[..., list[Port]]],
+    roads: RoadDimensions,
+    junctions: JunctionNumbers,
+    ramps: Callable[[np.random.Generator, str], Callable[..., Carriageway]] | None = None,
 ) -> Network | None:
-    """Builds a plan; None if two nodes are too close for their blocks, or a street would have to change two lanes."""
+    """Builds a plan; None if two nodes are too close for their blocks, or a street would have to change two lanes.
+
+    Args:
+        ramps: draws the builder of a direction with a ramp; of plans that have any.
+    """
     network = Network()
     ports: dict[tuple[int, int], Port] = {}  # by node and edge
     for index, node in enumerate(plan.nodes):
         edges = sorted(plan.edges_at(index), key=lambda edge: plan.yaw(edge, index) % (2 * np.pi))
         street, yaw = plan.edges[edges[0]].street, plan.yaw(edges[0], index)
-        if node.kind == "outlet":
-            no_lanes = [[]] * street.lanes
-            ends = [Port(node.place, yaw, street, no_lanes, no_lanes, [], [])]
+        if node.kind in ("outlet", "end", "joint"):
+            no_lanes = [[]] * plan.edges[max(edges)].street.lanes
+            ends = [Port(node.place, plan.yaw(edge, index), plan.edges[edge].street, no_lanes, no_lanes, [], []) for edge in edges]
         elif node.kind == "lot":
             ends = builders["parking_lot"](rng, network, node.place, yaw, street)
         else:
             ends = _build_junction(rng, network, plan, index, edges, builders, junctions)
+        if node.kind == "end":
+            network.leave_open(node.place, yaw + np.pi, street.half_width() - street.parking + roads.shoulder_m)
         ports |= {(index, edge): port for edge, port in zip(edges, ends, strict=True)}
     for number, edge in enumerate(plan.edges):
         first, second = ports[edge.a, number], ports[edge.b, number]
+        build = None if ramps is None or not edge.ramp else ramps(rng, edge.ramp)
         corners = _corners(first, second, edge)
         changes = [abs(len(a.leaving) - len(b.entering)) for a, b in ((first, second), (second, first))]
         if corners is None or max(changes) > 1:
             return None
-        connect_ports(network, first, second, corners, roads)
+        forward, backward = connect_ports(network, first, second, corners, roads, build)
+        if plan.nodes[edge.b].kind == "joint":  # the road after it goes on from the lanes of this one
+            following = max(plan.edges_at(edge.b))
+            leaving, entering = ([[lane] for lane in lanes] for lanes in (forward.end, backward.start))
+            port = ports[edge.b, following]._replace(leaving=leaving, entering=entering)
+            ports[edge.b, following] = port._replace(cycles_leaving=forward.cycles, cycles_entering=backward.cycles)
     return network
 
 

@@ -9,6 +9,7 @@ from scenefactory_jax.data.generators.town.road_network import Network
 
 SIMPLIFY_M = 0.03  # maximum distance of a simplified edge from the boundary
 MIN_EDGE_M = 1.0
+SAME_M = 1e-3  # points of a cut edge that are closer are one
 
 
 def boundary(
@@ -29,15 +30,18 @@ def boundary(
     rings = [part.exterior for part in solid] + [ring for ring in gaps if shapely.Polygon(ring).area > block_m2]
     island_rings = [ring for ring in gaps if shapely.Polygon(ring).area <= block_m2]
     island_rings += [orient(island, -1.0).exterior for island in network.islands]
-    outer, inner = ([piece for ring in group for piece in _cut_ring(ring, reach, spacing_m)] for group in (rings, island_rings))
+    open_ends = shapely.union_all(network.open_ends)
+    outer, inner = ([piece for ring in group for piece in _cut_ring(ring, reach, spacing_m, open_ends)] for group in (rings, island_rings))
     surface = shapely.difference(shapely.MultiPolygon(solid), shapely.union_all(network.islands))
     return outer, inner, surface
 
 
-def _cut_ring(ring: shapely.LinearRing, reach: float, spacing: float) -> list[Points]:
-    """Cuts the parts of a ring within the square, simplified, in segments no longer than `spacing`."""
+def _cut_ring(ring: shapely.LinearRing, reach: float, spacing: float, open_ends: shapely.Geometry) -> list[Points]:
+    """Cuts the parts of a ring within the square and outside of open ends, simplified, in segments no longer than `spacing`."""
     line = shapely.LineString(ring).simplify(SIMPLIFY_M)
     within = shapely.clip_by_rect(line, -reach, -reach, reach, reach)
+    if not shapely.is_empty(open_ends):
+        within = shapely.simplify(shapely.difference(within, open_ends), SAME_M)
     if within.geom_type == "MultiLineString":
         within = shapely.line_merge(within)
     parts = [part for part in getattr(within, "geoms", [within]) if part.geom_type == "LineString" and part.length > MIN_EDGE_M]

@@ -1,7 +1,8 @@
 """Builds a motorway through the middle of a town: two carriageways, each with up to two ramps."""
 
 import itertools
-from typing import Annotated
+from dataclasses import replace
+from typing import Annotated, NamedTuple
 
 import numpy as np
 import shapely
@@ -10,7 +11,7 @@ from scenefactory_jax.core.schema import Bounds, Fraction, Positive, Range
 from scenefactory_jax.core.types import LANE_FREEWAY
 from scenefactory_jax.data.generators.curves import FINE_M, Curve, easing_bend, integrate
 from scenefactory_jax.data.generators.town.road_network import DOUBLE_YELLOW, ON_ROAD, Lane, Network, Place, Street
-from scenefactory_jax.data.generators.town.road_segments import RoadDimensions, build_carriageway, shift_line
+from scenefactory_jax.data.generators.town.road_segments import Carriageway, RoadDimensions, build_carriageway, shift_line
 
 PlaceRange = Annotated[tuple[float, float], Bounds(is_range=True)]
 RANK = 3  # of the motorway as a street
@@ -55,28 +56,75 @@ def motorway(
         dimensions = RoadDimensions(
             bay_m=taken, hold_m=added, taper_m=taper_m, solid_m=0.0, shoulder_m=shoulder_m, spot_m=1.0, spot_margin_m=0.0
         )
-        for lane, place, out, joins in _build_carriageway(network, direction, street, dimensions, join, leave):
+        network.add_block("motorway")
+        for meeting in _build_carriageway(network, direction, street, dimensions, join, leave)[1]:
             turn = np.radians(rng.uniform(*ramp_turn_deg))
-            bends, step = easing_bend(half, turn if joins else -turn, ramp_radius_m, RAMP_EASING_M, lead=RAMP_LEAD_M)
-            points, _ = integrate(place, out, bends, step)  # both kinds of ramp bend to the right of the carriageway
-            network.add_block("merge" if joins else "ramp")
-            ramp = network.add_lane(Lane(points[::-1] if joins else points, lane_width_m, ramp_limit_mps, ON_ROAD, LANE_FREEWAY))
-            network.link(*((ramp, lane) if joins else (lane, ramp)))
-            line = shapely.LineString(network.lanes[ramp].points).simplify(0.02)
-            network.areas.append(line.buffer(lane_width_m / 2 + shoulder_m, cap_style="flat"))
+            add_ramp(network, meeting, street, dimensions, length=half, turn=turn, radius=ramp_radius_m, limit=ramp_limit_mps)
     if median > 2 * shoulder_m + 1.0:
         network.islands.append(shapely.LineString(curve[0]).simplify(0.02).buffer(median / 2 - shoulder_m, cap_style="flat"))
     return network
 
 
+class Meeting(NamedTuple):
+    """Where a ramp meets a carriageway."""
+
+    lane: int
+    place: Place
+    yaw: float  # out of the carriageway
+    joins: bool
+
+
+def add_ramp(
+    network: Network,
+    meeting: Meeting,
+    street: Street,
+    dimensions: RoadDimensions,
+    *,
+    length: float,
+    turn: float,  # away from the carriageway
+    radius: float,
+    limit: float,
+) -> Curve:
+    """Builds the lane of a ramp and returns its curve from the carriageway outward; both kinds bend to the right of the carriageway."""
+    lane, place, out, joins = meeting
+    bends, step = easing_bend(length, turn if joins else -turn, radius, RAMP_EASING_M, lead=RAMP_LEAD_M)
+    points, yaw = integrate(place, out, bends, step)
+    network.add_block("merge" if joins else "ramp")
+    ramp = network.add_lane(Lane(points[::-1] if joins else points, street.width, limit, ON_ROAD, street.kind))
+    network.link(*((ramp, lane) if joins else (lane, ramp)))
+    line = shapely.LineString(network.lanes[ramp].points).simplify(0.02)
+    network.areas.append(line.buffer(street.width / 2 + dimensions.shoulder_m, cap_style="flat"))
+    return points, yaw
+
+
+def build_with_ramp(
+    network: Network,
+    curve: Curve,
+    before: int,
+    behind: int,
+    street: Street,
+    dimensions: RoadDimensions,
+    *,
+    side: str,  # as of `build_carriageway`; a ramp is on the right
+    controlled: bool,
+    joins: bool,
+    auxiliary: float,
+    **ramp: float,
+) -> Carriageway:
+    """Builds one direction of a road with a ramp at its middle, whose other end stays open; `ramp`: see `add_ramp`."""
+    lengths, meet = replace(dimensions, bay_m=auxiliary, hold_m=auxiliary), len(curve[0]) // 2
+    ways, (meeting,) = _build_carriageway(
+        network, curve, street._replace(lanes=before), lengths, meet if joins else None, None if joins else meet
+    )
+    points, yaw = add_ramp(network, meeting, street, dimensions, limit=street.limit, **ramp)
+    network.leave_open(points[-1], float(yaw[-1]), street.width / 2 + dimensions.shoulder_m)
+    return Carriageway(ways[0].start, ways[-1].end, [])
+
+
 def _build_carriageway(
     network: Network, curve: Curve, street: Street, dimensions: RoadDimensions, join: int | None, leave: int | None
-) -> list[tuple[int, Place, float, bool]]:
-    """Builds one direction with its lanes on the right of the curve; the ramps meet it at the given points of the curve.
-
-    Returns:
-        For each ramp the lane that it meets, the place, the yaw out of the carriageway, and whether the ramp joins.
-    """
+) -> tuple[list[Carriageway], list[Meeting]]:
+    """Builds the stretches of one direction with its lanes on the right of the curve; ramps meet it at the given points of the curve."""
     count, last = street.lanes, len(curve[0]) - 1
     stretches = []  # first point, last point, lanes at the start, lanes at the end
     at = 0
@@ -85,7 +133,6 @@ def _build_carriageway(
         stretches += [(0, join, count, count), (join, at, count + 1, count)]
     if leave is not None:
         stretches += [(at, leave, count, count + 1), (leave, last, count, count)]
-    network.add_block("motorway")
     ways = [
         build_carriageway(
             network, (curve[0][a : b + 1], curve[1][a : b + 1]), before, behind, street, dimensions, side="right", controlled=False
@@ -101,5 +148,5 @@ def _build_carriageway(
         for lane, row, wide, joins in ((way.start[-1], a, before, True), (way.end[-1], b, behind, False)):
             if wide > count:
                 place = shift_line((curve[0][row : row + 1], curve[1][row : row + 1]), beside)[0]
-                ramps.append((lane, place, float(curve[1][row]) + (np.pi if joins else 0.0), joins))
-    return ramps
+                ramps.append(Meeting(lane, place, float(curve[1][row]) + (np.pi if joins else 0.0), joins))
+    return ways, ramps

@@ -13,12 +13,13 @@ import shapely
 from jaxtyping import Float
 
 from scenefactory_jax.core.types import LANE_STREET
-from scenefactory_jax.data.generators.curves import Points
+from scenefactory_jax.data.generators.curves import Points, heading
 
 Place = Float[np.ndarray, " 2"]
 Pose = tuple[Place, float]  # place, yaw
 Slots = Sequence[Sequence[int]]  # lanes at each slot of a port; slots are counted from the middle of the road outward
 BROKEN_WHITE, SOLID_WHITE, BROKEN_YELLOW, SOLID_YELLOW, DOUBLE_YELLOW = 6, 7, 9, 11, 12  # WOMD map element ids
+OPEN_M = 8.0  # behind the end of a road, more than a car reaches out of its lane
 WALKING, ON_ROAD, MERGING, CHANGING = 90, 60, 20, 5  # right of way outside of junctions: the higher rank goes first
 
 
@@ -32,8 +33,12 @@ class Street(NamedTuple):
     rank: int  # at a junction without lights the higher rank goes first
     bike: float  # width of a bicycle lane at each side, m; 0: none
     parking: float  # width of a strip of parked cars at each side, m; 0: none
-    centre_line: int  # map element
+    centre_line: int | None  # map element; None: not painted
     kind: int = LANE_STREET
+
+    def half_width(self) -> float:
+        """Computes the distance from the middle of the road to the outer side of all lanes and parked cars."""
+        return self.median / 2 + self.lanes * self.width + self.bike + self.parking
 
 
 class Lane(NamedTuple):
@@ -97,6 +102,7 @@ class Network:
     spots: list[Pose] = field(default_factory=list)  # of parked cars
     phases: dict[int, list[frozenset[int]]] = field(default_factory=dict)  # junction with lights -> arms that have green together
     blocks: list[str] = field(default_factory=list)  # kinds of all blocks
+    open_ends: list[shapely.Polygon] = field(default_factory=list)  # ground behind the ends of roads within the town: no kerbs there
 
     def add_block(self, kind: str) -> int:
         """Adds a block and returns its index."""
@@ -109,6 +115,13 @@ class Network:
         for links in (self.entries, self.exits, self.left, self.right):
             links.append([])
         return len(self.lanes) - 1
+
+    def leave_open(self, place: Place, yaw: float, half_width: float) -> None:
+        """Paves the ground behind the end of a road, so that cars leave it without meeting a kerb."""
+        ahead, left = heading(yaw), heading(yaw + np.pi / 2)
+        for ground, far, half in ((self.areas, OPEN_M, half_width), (self.open_ends, OPEN_M + 1.0, half_width + 3.0)):
+            corners = ((0.0, -half), (far, -half), (far, half), (0.0, half))
+            ground.append(shapely.Polygon([place + x * ahead + y * left for x, y in corners]))
 
     def link(self, lane: int, follower: int) -> None:
         """Leads a lane into another."""

@@ -1,6 +1,7 @@
 """Builds roads between ports: straight or curved, with lanes gained before a junction and dropped behind one."""
 
 import itertools
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -17,6 +18,7 @@ from scenefactory_jax.data.generators.town.road_network import BROKEN_WHITE, SOL
 CURVE_RAD = np.radians(20.0)  # a road with a larger range of yaw is a curve
 MIN_LANE_M = 6.0  # length of a lane before and behind a taper
 MIN_PARKING_ROAD_M = 40.0  # length of a road with parking spaces
+
 
 @dataclass(frozen=True)
 class RoadDimensions:
@@ -39,28 +41,39 @@ class Carriageway(NamedTuple):
     cycles: list[int]
 
 
-def connect_ports(network: Network, first: Port, second: Port, via: list[Pose], dimensions: RoadDimensions) -> None:
-    """Builds the road between two ports.
+def connect_ports(
+    network: Network,
+    first: Port,
+    second: Port,
+    via: list[Pose],
+    dimensions: RoadDimensions,
+    build_forward: Callable[..., Carriageway] | None = None,
+) -> tuple[Carriageway, Carriageway]:
+    """Builds the road between two ports and returns its two directions, that from the first port to the second before the other.
 
     Args:
         via: poses of the middle line where bends begin and end, in the order from the first port to the second.
+        build_forward: in place of `build_carriageway` for the direction from the first port to the second.
     """
     street, (points, yaw) = first.street, _middle_line(first, second, via)
     changes = [len(b.entering) - len(a.leaving) for a, b in ((first, second), (second, first))]
     kind = "curve" if np.ptp(yaw) > CURVE_RAD else "straight"
     network.add_block("lane_drop" if min(changes) < 0 else "lane_gain" if max(changes) > 0 else kind)
-    for curve, a, b in (((points, yaw), first, second), ((points[::-1], yaw[::-1] + np.pi), second, first)):
-        way = build_carriageway(
-            network, curve, len(a.leaving), len(b.entering), street, dimensions, side=b.side, controlled=b.controlled
-        )
+    ways = []
+    builders = (build_forward or build_carriageway, build_carriageway)
+    curves_of_both = ((points, yaw), (points[::-1], yaw[::-1] + np.pi))
+    for build, curve, a, b in zip(builders, curves_of_both, (first, second), (second, first), strict=True):
+        way = build(network, curve, len(a.leaving), len(b.entering), street, dimensions, side=b.side, controlled=b.controlled)
+        ways.append(way)
         network.link_slots([*a.leaving, a.cycles_leaving], [*([lane] for lane in way.start), way.cycles])
         network.link_slots([*([lane] for lane in way.end), way.cycles], [*b.entering, b.cycles_entering])
-    if street.median == 0:
+    if street.median == 0 and street.centre_line is not None:
         network.lines.append((street.centre_line, points))
     if street.median > 2 * dimensions.shoulder_m + 0.5:
         half = street.median / 2 - dimensions.shoulder_m
         trim = max(2, round((half + 1.0) / FINE_M))
         network.islands.append(shapely.LineString(points[trim:-trim]).simplify(0.02).buffer(half, quad_segs=4))
+    return ways[0], ways[1]
 
 
 def _middle_line(first: Port, second: Port, via: list[Pose]) -> Curve:

@@ -46,6 +46,8 @@ class DrivingNumbers:
     braking_mps2: float  # before bends
     lane_change_fraction: Fraction  # probability of a lane change on a lane that is long enough
     lane_change_m: Range  # length of a lane change
+    platoon_fraction: Fraction = 0.0  # of the cars that start near another one, on its lane or beside it; runs of before have none
+    platoon_m: Range = (8.0, 20.0)  # from it
 
     def draw_size(self, rng: np.random.Generator) -> tuple[float, float, float]:
         """Draws length, width and height of a car, all at the same fraction of their ranges."""
@@ -85,6 +87,7 @@ def draw_cars(
     inlets = [i for i in usable if not network.entries[i] and network.exits[i] and np.abs(network.lanes[i].points[0]).max() < 2 * reach]
     cars: list[SimulatedUser] = []
     places: list[np.ndarray] = []
+    starts: list[tuple[int, int]] = []  # lane and row of the cars at `places`
     for _ in range(6 * count + 30):
         if len(cars) == count:
             break
@@ -93,6 +96,9 @@ def draw_cars(
         index = int(rng.choice(inlets)) if later else usable[int(rng.choice(len(usable), p=weights / weights.sum()))]
         lane = network.lanes[index]
         row = round(size[0] / 2 / FINE_M) + 2 if later else int(rng.integers(len(lane.points)))
+        if driving.platoon_fraction > 0 and starts and not later and rng.random() < driving.platoon_fraction:
+            index, row = _draw_near(rng, network, *starts[int(rng.integers(len(starts)))], driving)
+            lane = network.lanes[index]
         place = lane.points[min(row, len(lane.points) - 1)]
         gap = driving.start_gap_m + size[0] / 2
         expected = _predict_place(rng, lane, row, times) if lane.kind == LANE_FREEWAY else place
@@ -104,9 +110,17 @@ def draw_cars(
             continue
         if not later:
             places.append(place)
+            starts.append((index, row))
         speed = float(path.speed[0] * rng.uniform(0.6, 1.0))
         cars.append(SimulatedUser("vehicle", size, path, speed, float(rng.uniform(times[0], times[-1])) if later else -np.inf))
     return cars
+
+
+def _draw_near(rng: np.random.Generator, network: Network, lane: int, row: int, driving: DrivingNumbers) -> tuple[int, int]:
+    """Draws a place before or behind a car, on its lane or one beside it, as its lane and row."""
+    index = int(rng.choice([lane, *network.left[lane], *network.right[lane]]))
+    away = float(rng.choice([-1.0, 1.0]) * rng.uniform(*driving.platoon_m)) / FINE_M
+    return index, int(np.clip(row + away, 0, len(network.lanes[index].points) - 1))
 
 
 def _predict_place(rng: np.random.Generator, lane: Lane, row: int, times: Float[np.ndarray, " L"]) -> Place:

@@ -30,15 +30,22 @@ class StreetClass:
     bike_width_m: float
     parking_fraction: Fraction
     parking_width_m: float
+    unpainted_fraction: Fraction = 0.0  # without a line between the directions; runs of before have none
 
 
 Classes = Mapping[int, StreetClass]  # by rank
 
 
-class Node(NamedTuple):
-    """A junction, a driveway, a parking lot, or a place outside of the town to which a street leads."""
+NodeKind = Literal["junction", "roundabout", "outlet", "driveway", "lot", "joint", "end"]
 
-    kind: Literal["junction", "roundabout", "outlet", "driveway", "lot"]
+
+class Node(NamedTuple):
+    """A junction, a driveway, a parking lot, or a place outside of the town to which a street leads.
+
+    Of a sequence of blocks, too: the place where one road goes on as another, and an end where nothing more is drawn.
+    """
+
+    kind: NodeKind
     place: Place
 
 
@@ -49,6 +56,7 @@ class Edge(NamedTuple):
     b: int
     street: Street
     via: tuple[Place, ...] = ()
+    ramp: str = ""  # "joins", "leaves": a ramp on the right of the way from a to b
 
     def places(self, nodes: Sequence[Node]) -> list[Place]:
         """Both ends and the corners between them."""
@@ -60,7 +68,7 @@ class Edge(NamedTuple):
 
     def starting_at(self, node: int) -> "Edge":
         """The edge from one of its nodes to the other."""
-        return self if self.a == node else Edge(self.b, self.a, self.street, self.via[::-1])
+        return self if self.a == node else self._replace(a=self.b, b=self.a, via=self.via[::-1])
 
 
 class Plan(NamedTuple):
@@ -88,6 +96,7 @@ def draw_street(rng: np.random.Generator, classes: Classes) -> Street:
     width, limit = rng.uniform(*kind.lane_width_m), rng.uniform(*kind.speed_limit_mps)
     chance, median = rng.random(3), rng.uniform(*kind.median_m)
     lines = (DOUBLE_YELLOW, SOLID_YELLOW) if lanes > 1 or rank > 1 else (DOUBLE_YELLOW, SOLID_YELLOW, BROKEN_YELLOW)
+    line = int(rng.choice(lines))
     return Street(
         lanes=lanes,
         width=width,
@@ -96,7 +105,7 @@ def draw_street(rng: np.random.Generator, classes: Classes) -> Street:
         rank=rank,
         bike=kind.bike_width_m if chance[1] < kind.bike_fraction else 0.0,
         parking=kind.parking_width_m if chance[2] < kind.parking_fraction else 0.0,
-        centre_line=int(rng.choice(lines)),
+        centre_line=None if kind.unpainted_fraction > 0 and rng.random() < kind.unpainted_fraction else line,
     )
 
 

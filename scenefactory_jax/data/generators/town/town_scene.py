@@ -1,28 +1,37 @@
 """Generates a random town in the form of a logged scene."""
 
+import functools
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from typing import Any, NamedTuple
 
 import numpy as np
+import shapely
 from jaxtyping import Float
 
 from scenefactory_jax.core.instantiate import instantiate
 from scenefactory_jax.core.raw_scene import Light, Polyline, RawScene, SceneError, Track
 from scenefactory_jax.core.scene_arrays import wrap_angles
-from scenefactory_jax.core.schema import ConfigError, NonNegative, Positive
+from scenefactory_jax.core.schema import ConfigError, Fraction, NonNegative, Positive
 from scenefactory_jax.core.types import CROSSWALK, DRIVEWAY, EDGE_BOUNDARY, EDGE_MEDIAN, STOP_SIGN
 from scenefactory_jax.data.generators.curves import Points, heading, resample
+from scenefactory_jax.data.generators.town import settings
+from scenefactory_jax.data.generators.town.block_sequence import draw_blocks
 from scenefactory_jax.data.generators.town.hills import Hills, add_hills
+from scenefactory_jax.data.generators.town.map_recording import MapRecording, record_map
 from scenefactory_jax.data.generators.town.road_network import Network
 from scenefactory_jax.data.generators.town.road_users import TownUser
+from scenefactory_jax.data.generators.town.settings import DifficultyEnds, Variant
 from scenefactory_jax.data.generators.town.traffic import add_warmup
 from scenefactory_jax.data.generators.town.traffic_lights import Gates
 
 PACKAGE = "scenefactory_jax.data.generators.town"
+MODULES = {"network": "build_network"}  # of entries whose module has another name
+BEYOND_M = 10.0  # around a road of blocks, in which nothing of it is cut off
 MAX_REDRAWS = 40  # towns that are drawn until one can be built and has enough moving cars
 MAX_TRAFFIC_REDRAWS = 3  # on one network
-HILLS = 0x68696C6C  # of the seed of the hills, so that a town is the same with and without them
+# of seeds of their own, so that a town is the same with and without hills
+HILLS, RECORDING, VARIANT, BLOCKS = 0x68696C6C, 0x6D6170, 0x766172, 0x626C6B
 
 
 class Log(NamedTuple):
@@ -56,12 +65,16 @@ def generate(
     warmup_s: NonNegative,
     max_sdc_distance_m: Positive,
     sensor_range_m: Positive,
-    hills: Hills | None = None,  # runs of before have none
+    hills: Hills | None = None,  # runs of before have none of these
+    recording: MapRecording | None = None,
+    variants: dict[str, Variant] | None = None,
+    blocks: str | list[str] | int | None = None,
+    difficulty: Fraction | None = None,
+    difficulty_ends: DifficultyEnds | None = None,
 ) -> RawScene:
     """Generates scene `index` of the series `seed`: a road network, traffic lights and simulated traffic.
 
-    The scene depends on seed, index and numbers alone. Coordinates are metres around the middle of the town; `sdc` is a moving car near it.
-    The numbers are described in `conf/scenes/town.yaml`.
+    The scene depends on seed, index and numbers alone, described in `conf/scenes/town.yaml`. Coordinates are metres around the middle.
 
     Args:
         network: entry of the roads, `(rng, reach, kind) -> (kind, Network)`, or None if the drawn plan cannot be built.
@@ -69,6 +82,9 @@ def generate(
         driveways: entry of the private driveways, `(rng, network, kerbs, surface) -> outlines, spots`.
         traffic_lights: entry of the lights, `(rng, network, times) -> Gates`.
         traffic: entry of the road users, `(rng, network, kerbs, surface, reach, times, gates) -> users`, with `cars` and `travel_m`.
+        variants: kinds of towns of which each scene is one; their changes are those of the five entries, as are those of `difficulty_ends`.
+        blocks: letters of the blocks of a road (`block_sequence.BLOCKS`); several such texts that take turns; a number of drawn blocks.
+        difficulty: where the numbers lie between those of `difficulty_ends`; None: the entries as they are.
 
     Raises:
         ConfigError: an unknown key or a number out of range.
@@ -78,21 +94,20 @@ def generate(
         raise ConfigError(f"generate: expected seed and index >= 0, got {seed} and {index}")
     if not 0 <= log_current < log_steps - 1:
         raise ConfigError(f"generate.log_current: expected 0 .. log_steps - 2 = {log_steps - 2}, got {log_current}")
-    entries = {"build_network": network, "kerbs": kerbs, "driveways": driveways, "traffic_lights": traffic_lights, "traffic": traffic}
-    parts = [
-        instantiate(entry, builtins=f"{PACKAGE}.{module}", where=f"generate.{module.removeprefix('build_')}")
-        for module, entry in entries.items()
-    ]
-    times = log_dt * np.arange(log_steps)
-    log = Log(times, log_current, warmup_s, max_sdc_distance_m, sensor_range_m, traffic["travel_m"][0], traffic["cars"][0])
-    kind = kinds[index % len(kinds)] if kinds else None
+    draw = lambda *more: np.random.default_rng(np.random.SeedSequence((seed, index, *more)))  # noqa: E731
+    entries = {"network": network, "kerbs": kerbs, "driveways": driveways, "traffic_lights": traffic_lights, "traffic": traffic}
+    entries = settings.change(entries, draw(VARIANT), variants, difficulty, difficulty_ends)
+    parts = [instantiate(entry, builtins=f"{PACKAGE}.{MODULES.get(key, key)}", where=f"generate.{key}") for key, entry in entries.items()]
+    if blocks is not None:
+        parts[0] = functools.partial(parts[0], sequence=draw_blocks(draw(BLOCKS), blocks, index))
+    times, travel, cars = log_dt * np.arange(log_steps), entries["traffic"]["travel_m"][0], entries["traffic"]["cars"][0]
+    log = Log(times, log_current, warmup_s, max_sdc_distance_m, sensor_range_m, travel, cars)
     for redraw in range(MAX_REDRAWS):
-        rng = np.random.default_rng(np.random.SeedSequence((seed, index, redraw)))
-        scene = _draw_scene(rng, kind, reach_m, parts, log, lane_spacing_m, line_spacing_m)
+        scene = _draw_scene(draw(redraw), kinds[index % len(kinds)] if kinds else None, reach_m, parts, log, lane_spacing_m, line_spacing_m)
         if scene is not None:
             name, source = f"{scene.name}-{seed}-{index:06d}", f"generator, seed {seed}, index {index}"
-            if hills is not None:
-                scene = add_hills(scene, np.random.default_rng(np.random.SeedSequence((seed, index, redraw, HILLS))), hills)
+            scene = scene if recording is None else record_map(scene, draw(redraw, RECORDING), recording)
+            scene = scene if hills is None else add_hills(scene, draw(redraw, HILLS), hills)
             return replace(scene, name=name, source=source, metadata=scene.metadata | {"seed": seed, "index": index})
     raise SceneError(f"generate.traffic.cars: {MAX_REDRAWS} towns had fewer than {log.min_cars} moving cars; give a lower minimum")
 
@@ -112,6 +127,8 @@ def _draw_scene(
     if drawn is None:
         return None
     kind, network = drawn
+    if network.open_ends:  # a road of blocks is as long as it is
+        reach = max(reach, float(np.abs(shapely.total_bounds(network.areas)).max()) + BEYOND_M)
     outer, islands, surface = compute_kerbs(network, reach)
     pavements = [] if kind == "motorway" else outer
     driveways, spots = draw_driveways(rng, network, pavements, surface)
