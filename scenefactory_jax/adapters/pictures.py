@@ -60,7 +60,7 @@ class Painter:
             control_hz=self._pool.step_hz,
             title="",
             weather="",
-            traffic=TrafficBoxes(*(column[None] for column in TrafficBoxes.from_boxes(shown.boxes))),
+            traffic=jax.tree.map(lambda one: one[None], TrafficBoxes.from_boxes(shown.boxes)),
             start_s=float(shown.step) / (self._pool.step_hz * self._pool.env.action_repeat),
         )
         left, bottom = place[0] - _SIDE_M / 2

@@ -52,14 +52,19 @@ def _run(name: str, function: Function, arguments: Sequence[str], about: str) ->
         return
     if flags.resolve and not flags.cfg:
         raise ConfigError("--resolve: expected --cfg job beside it")
-    varied: set[str] = set()
+    overrides, varied, config = configs.as_overrides(flags), set[str](), None
     if flags.cfg:
-        configs.load_with_choices(name, *configs.as_overrides(flags))
+        configs.load_with_choices(name, *overrides)
+    elif flags.multirun:
+        varied = _check_sweep(name, overrides)
     elif not (flags.hydra_help or flags.shell_completion or flags.info or flags.experimental_rerun):
-        varied = _check(name, configs.as_overrides(flags), sweeps=flags.multirun)
+        config = configs.load_config(name, *overrides)  # before Hydra does, for better messages
     sys.argv = [f"{sys.argv[0]} {name}", *map(configs.quote_override, arguments)]
-    folder = str(configs.find_conf() / "command")
-    hydra.main(version_base="1.3", config_path=folder, config_name=flags.config_name or name)(_make_job(name, function, varied))()
+    job = _make_job(name, function, varied)
+    if config is not None and flags.config_name is None and not any(word.startswith("hydra") for word in (*overrides, *flags.overrides)):
+        return job(config)  # nothing of Hydra's own is asked for, which would compose the same again
+    folder, primary = str(configs.find_conf() / "command"), flags.config_name or name
+    hydra.main(version_base="1.3", config_path=folder, config_name=primary)(lambda composed: job(configs.to_dict(composed)))()
 
 
 def _format_help(name: str, overrides: Sequence[str], about: str) -> str:
@@ -71,15 +76,12 @@ def _format_help(name: str, overrides: Sequence[str], about: str) -> str:
     return f"{name}: {about}\n\n{annotated_config.annotate(name, *chosen, *overrides)}\n\n{last}"
 
 
-def _check(name: str, overrides: Sequence[str], *, sweeps: bool) -> set[str]:
-    """Checks the keys before Hydra does, for better messages, and that no two jobs of a sweep evaluate into one folder.
+def _check_sweep(name: str, overrides: Sequence[str]) -> set[str]:
+    """Checks the keys of a sweep before Hydra does, and that no two of its jobs evaluate into one folder.
 
     Returns:
-        The keys that vary in a sweep.
+        The keys that vary.
     """
-    if not sweeps:
-        configs.load_config(name, *overrides)
-        return set()
     first, varied = configs.sweep(overrides)
     out = next((word for word in overrides if word.startswith("out=")), "")
     separate = "${" in out or "out" in varied or (not out and varied <= {"run"})
@@ -90,12 +92,11 @@ def _check(name: str, overrides: Sequence[str], *, sweeps: bool) -> set[str]:
     return varied
 
 
-def _make_job(name: str, function: Function, varied: set[str]) -> Callable[[Any], None]:
-    """Returns the function that Hydra calls with the config of each job."""
+def _make_job(name: str, function: Function, varied: set[str]) -> Callable[[dict[str, Any]], None]:
+    """Returns the function that runs the command with the config of a job."""
 
-    def job(config: Any) -> None:
+    def job(settings: dict[str, Any]) -> None:
         try:
-            settings = configs.to_dict(config)
             if name == "train" and varied and settings["out"] is None:
                 from scenefactory_jax.learning import run_folder
 
@@ -108,7 +109,7 @@ def _make_job(name: str, function: Function, varied: set[str]) -> Callable[[Any]
                 raise
             end(error)
         except Exception as error:
-            if (line := _explain(error, configs.to_dict(config))) is None:
+            if (line := _explain(error, settings)) is None:
                 raise
             end(line)
 

@@ -183,7 +183,7 @@ def test_a_report_is_drawn_again_from_its_numbers(done, tmp_path):
         study(toy(tmp_path) | {"parts": None})
 
 
-def test_a_report_of_a_validation_cut_says_so_and_how_to_repeat_it(done, tmp_path):
+def test_a_report_of_a_validation_cut_says_so_and_how_to_repeat_it(done, tmp_path, undrawn_figures):
     folder, result, _ = done
     (tmp_path / "out").mkdir()
     (tmp_path / "out" / "result.json").write_text(json.dumps(result | {"settings": result["settings"] | {"cut": "validation"}}))
@@ -273,7 +273,7 @@ def test_a_condition_may_name_a_protocol(tmp_path):
             study_plan.make(toy(tmp_path, **{**ALONE, **changes}))
 
 
-def test_a_result_of_other_runs_is_not_written_over_with_nothing(done, tmp_path, capsys):
+def test_a_result_of_other_runs_is_not_written_over_with_nothing(done, tmp_path, capsys, undrawn_figures):
     folder, result, _ = done
     shutil.copytree(folder / "out", tmp_path / "out")
     assert study(toy(tmp_path, "parts=report"))["rows"] == result["rows"]
@@ -290,7 +290,7 @@ def test_an_interval_that_misses_its_value_is_drawn_up_to_it():
 # ---- nothing twice
 
 
-def test_what_is_done_is_not_done_again(done, monkeypatch):
+def test_what_is_done_is_not_done_again(done, monkeypatch, undrawn_figures):
     folder, result, _ = done
     monkeypatch.setattr(training_loop, "train", lambda *a, **k: pytest.fail("trained again"))
     monkeypatch.setattr(command, "make_evaluator", lambda *a, **k: pytest.fail("evaluated again"))
@@ -444,7 +444,7 @@ def steps_of(config):
 
 
 TIMED = {"vmax": "vmax", "plants": "vmax", "scenarionet": "scenarionet", "curriculum": "scenarionet"}  # study -> its protocol
-TIMED |= {"learners": "route100"}
+TIMED |= {"learners": "route100", "vmax_scenes": "vmax"}
 MANY = ("curriculum", "plants")  # environments
 STREAMED = "recipe_drive"  # trains on a mixture of banks and generated scenes
 WHOLE = [name for name in STUDIES if name not in (*TIMED, STREAMED)]

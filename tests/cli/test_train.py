@@ -310,7 +310,7 @@ def told(report: Path):
     return hydra_config.load_config("evaluate", *shlex.split(line))
 
 
-def test_both_protocols_and_the_same_records_twice(whole, tmp_path):
+def test_both_protocols_and_the_same_records_twice(whole, tmp_path, undrawn_figures):
     result = judged(whole, tmp_path, "video.enable=false")
     assert set(result.records) == {"strict", "goal_only"} and result.report.is_file()
     assert (tmp_path / "agents-strict.csv").read_bytes() == (whole.folder / "agents-strict.csv").read_bytes()  # what training wrote
@@ -345,7 +345,7 @@ def test_other_settings_of_a_run(whole, tmp_path):
         evaluate(hydra_config.load_config("evaluate", f"run={tmp_path}"))
 
 
-def test_an_exported_policy_stands_for_its_run(whole, tmp_path, monkeypatch):
+def test_an_exported_policy_stands_for_its_run(whole, tmp_path, monkeypatch, undrawn_figures):
     """Judged alike, also by name as one of the package's own, and without a word about where scenes lay."""
     told = ["card.about='For tests.'", f"card.judged={{unseen roads: {whole.folder}}}"]
     kept = export(hydra_config.load_config("export", f"run={whole.folder}", f"out={tmp_path / 'pretrained' / 'handy'}", *told))
@@ -509,7 +509,7 @@ def test_an_interrupted_command_ends_as_shells_expect(monkeypatch, interruptible
     ways = {130: lambda: signal.raise_signal(signal.SIGINT), 143: lambda: interrupt.end(tmp_path, 1, signal.SIGTERM)}
     for code, end in ways.items():
         monkeypatch.setattr(sys, "argv", ["scenefactory_jax", "train"])
-        monkeypatch.setattr("hydra.main", lambda end=end, **_: lambda job: end)
+        monkeypatch.setattr("scenefactory_jax.cli.train.train", lambda config, end=end: end())
         with pytest.raises(SystemExit) as stopped:
             command_line.main()
         assert stopped.value.code == code
@@ -555,11 +555,6 @@ def test_a_wrong_value_ends_as_one_line():
 def test_what_a_user_can_mend_is_one_line(arguments, message, monkeypatch, capsys, tmp_path):
     monkeypatch.setattr(sys, "argv", ["scenefactory_jax", *arguments])
     monkeypatch.chdir(tmp_path)
-
-    def composing(*, config_name, **options):  # Hydra's own sets up logging anew, which closes the streams that pytest captures
-        return lambda job: lambda: job(OmegaConf.create(hydra_config.load_config(config_name, *arguments[1:])))
-
-    monkeypatch.setattr("hydra.main", composing)
     with pytest.raises(SystemExit) as stopped:
         command_line.main()
     text = capsys.readouterr().err or str(stopped.value)

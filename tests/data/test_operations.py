@@ -418,7 +418,7 @@ def test_a_stopped_conversion_is_told_beside_the_account(tmp_path, capsys):
     )
 
 
-def test_banks_are_judged_and_compared(town, tmp_path):
+def test_banks_are_judged_and_compared(town, tmp_path, undrawn_figures):
     counts = command(town, "op=quality", f"out={tmp_path / 'quality'}", "quality.report.examples=1")
     assert counts.keys() == hydra_config.load_config("scenes")["quality"]["rules"].keys()
     assert "12 scenes" in (tmp_path / "quality" / "quality.md").read_text()

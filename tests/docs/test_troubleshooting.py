@@ -10,11 +10,10 @@ from pathlib import Path
 
 import jax.numpy as jnp
 import pytest
-from omegaconf import OmegaConf
 from support.running import ROOT, shell, smoke
 
 import scenefactory_jax.__main__ as command_line
-from scenefactory_jax.cli import error_messages, hydra_config
+from scenefactory_jax.cli import error_messages
 from scenefactory_jax.cli.train import train
 from scenefactory_jax.core import config as run_config
 from scenefactory_jax.core.instantiate import ConfigError
@@ -78,11 +77,6 @@ def said(command, folder, monkeypatch, capsys) -> str:
     monkeypatch.syspath_prepend(str(folder))
     arguments = shlex.split(command.removeprefix(CALL))
     monkeypatch.setattr(sys, "argv", ["scenefactory_jax", *arguments])
-
-    def composing(*, config_name, **options):  # Hydra's own sets up logging anew, which closes the streams that pytest captures
-        return lambda job: lambda: job(OmegaConf.create(hydra_config.load_config(config_name, *arguments[1:])))
-
-    monkeypatch.setattr("hydra.main", composing)
     try:
         command_line.main()
     except SystemExit as stopped:

@@ -157,7 +157,7 @@ def test_starts_on_drawn_routes():
     lines = [STRAIGHT, STRAIGHT + np.array([0.0, 12.0]), STRAIGHT[::-1] + np.array([0.0, -12.0])]
     scene = routed_scene([STRAIGHT] * 3)
     with pytest.raises(ConfigError, match="scenes/pack/routes=drawn"):
-        none = {name: column_of(np.asarray(leaf)[:0], leaf.dtype) for name, leaf in vars(scene.routes).items()}
+        none = {name: column_of(np.asarray(leaf)[:0], leaf.dtype) for name, leaf in vars(scene.routes).items() if leaf is not None}
         bare = replace(scene, routes=type(scene.routes)(**none))
         spawning.make(numbers)(jax.random.key(0), bare)
     drawn = replace(scene, routes=routes_of(lines, owners=[-1, -1, -1], drawn=[False, True, True], limits=[10.0, 10.0, 10.0]))

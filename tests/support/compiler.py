@@ -1,13 +1,18 @@
-"""Settings of XLA for the tests, before JAX is imported: quick compilation, and one cache for all processes and later runs."""
+"""Settings for the tests, before JAX is imported: quick compilation, and one cache for all processes and later runs."""
 
 import contextlib
 import os
 import platform
+import sys
 import time
 from importlib.metadata import version
 from pathlib import Path
 
 os.environ.setdefault("MPLBACKEND", "Agg")
+# Python's own compilation of the package and the tests, with the checks of annotations, is half of their collection: processes that tests
+# start and later runs find it even where an image's environment asks for no such files.
+sys.dont_write_bytecode = False
+os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
 # Most of what the tests cost is XLA compiling programs that then run for a moment. So it compiles with less effort: LLVM at -O1 and, before
 # JAX 0.11 which has nothing else, no fusion emitters (they alone are a third of it; an unknown flag would end the process). `XLA_FLAGS=
 # pytest` tests what XLA makes by default, and `make test-slow` does.
