@@ -36,7 +36,7 @@ from scenefactory_jax.data.loading import scene_source
 from scenefactory_jax.env import environment
 from scenefactory_jax.evaluation import circumstances, failures, statistics
 from scenefactory_jax.evaluation.records import begin_folder, read_records, read_settings
-from scenefactory_jax.learning import checkpoint, interrupt, policy_io, run_folder
+from scenefactory_jax.learning import checkpoint, interrupt, policy_io, run_folder, run_paths
 from scenefactory_jax.learning.training_loop import make_policy, make_trainer, prepare
 from scenefactory_jax.loggers import metrics_csv
 from scenefactory_jax.visualization.report import evaluation_files, tables
@@ -359,7 +359,7 @@ def test_an_exported_policy_stands_for_its_run(whole, tmp_path, monkeypatch, und
     assert "- **unseen roads**: starts: as recorded, at the recorded speed; weather: AC 0 mm; background traffic: none; dynamics: `" in card
     assert (kept / "versions.yaml").read_text() == (whole.folder / "versions.yaml").read_text()
     assert hydra_config.read(kept)["scenes"]["heldout"]["path"] is None and str(tmp_path.parent) not in (kept / "config.yaml").read_text()
-    monkeypatch.setattr(policy_io, "SHIPPED", tmp_path / "pretrained")
+    monkeypatch.setattr(run_paths, "SHIPPED", tmp_path / "pretrained")
     monkeypatch.chdir(tmp_path)
     trained = scenefactory_jax.load_policy("handy")
     assert trained.folder == kept and trained.config["observations"] == whole.config["observations"]

@@ -430,7 +430,7 @@ def test_banks_are_judged_and_compared(town, tmp_path, undrawn_figures):
 @pytest.mark.parametrize(
     ("overrides", "message"),
     [
-        (["op=compare", "out=x"], "compare.others: expected paths, or options of `scenes`: hills, streets, town, womd; got"),
+        (["op=compare", "out=x"], "compare.others: expected paths, or options of `scenes`: blocks, hills, streets, town, town_womd, womd"),
         (["op=quality"], "out: expected a folder for the report, got null"),
         (["op=export", "export.format=bvh", "out=x"], "export.format: expected one of gpudrive, opendrive, scenarionet, womd, got 'bvh'"),
         (["op=export"], "out: expected a folder for the files, got null"),
