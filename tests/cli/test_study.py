@@ -545,6 +545,12 @@ def test_other_scenes_of_the_same_path_are_another_study(tmp_path):
     assert found[0][0] != found[1][0] and found[0][1] != found[1][1] and found[1] == found[2]
 
 
+def test_a_training_from_other_networks_is_another(tmp_path):
+    entry = toy(tmp_path, "train_scenes=train.bank", "test_scenes=test.bank", **ALONE)
+    plain, null, tuned = (study_plan.make({**entry, "common": words}).trainings[0] for words in ([], ["start_from=null"], ["start_from=drive"]))
+    assert plain.digest == null.digest != tuned.digest and plain.program == tuned.program
+
+
 @pytest.mark.parametrize("is_bank", [True, False])
 def test_readers_of_formats_change_no_study_of_banks(tmp_path, is_bank):
     """A version that reads one format more finds what was trained before."""
