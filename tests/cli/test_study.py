@@ -547,7 +547,8 @@ def test_other_scenes_of_the_same_path_are_another_study(tmp_path):
 
 def test_a_training_from_other_networks_is_another(tmp_path):
     entry = toy(tmp_path, "train_scenes=train.bank", "test_scenes=test.bank", **ALONE)
-    plain, null, tuned = (study_plan.make({**entry, "common": words}).trainings[0] for words in ([], ["start_from=null"], ["start_from=drive"]))
+    words = [], ["start_from=null"], ["start_from=drive"]
+    plain, null, tuned = (study_plan.make({**entry, "common": one}).trainings[0] for one in words)
     assert plain.digest == null.digest != tuned.digest and plain.program == tuned.program
 
 
