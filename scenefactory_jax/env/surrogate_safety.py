@@ -97,10 +97,13 @@ def separate_levels(pairs: Pairs, scene: Scene, motion: Motion) -> Pairs:
 
 def find_other_levels(scene: Scene, motion: Motion) -> Bool[Array, "A B"] | None:
     """Mask of the road users that are on another level than each car; None in a scene of one level."""
-    if scene.edges.height is None:
-        return None
-    height = motion.position[:, 2]
-    return jnp.abs(height[:, None] - jnp.concatenate([height, scene.traffic.elevation])) >= LEVEL_M
+    height = find_heights(scene, motion, scene.traffic)
+    return None if height is None else jnp.abs(motion.position[:, 2:] - height) >= LEVEL_M
+
+
+def find_heights(scene: Scene, motion: Motion, boxes: Boxes) -> Float[Array, " B"] | None:
+    """Heights of the cars and of the traffic, m; None in a scene of one level."""
+    return None if scene.edges.height is None else jnp.concatenate([motion.position[:, 2], boxes.elevation])
 
 
 def minimum_over_pairs(values: Float[Array, "A B"], present: Bool[Array, " B"]) -> Float[Array, " A"]:

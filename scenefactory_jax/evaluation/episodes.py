@@ -9,8 +9,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from scenefactory_jax.core.pytree import pytree_dataclass
-from scenefactory_jax.core.types import Boxes, Env, Events, Motion, Scene, State
-from scenefactory_jax.env import termination
+from scenefactory_jax.core.types import Env, Events, State
+from scenefactory_jax.env import surrogate_safety, termination
 from scenefactory_jax.env.rollout import ControlStep, Hook
 from scenefactory_jax.evaluation import route_signals
 from scenefactory_jax.evaluation.failure_signals import FailureSignals, SignalThresholds, begin_signals, update_signals
@@ -105,16 +105,11 @@ def make_hook(
             goal=state.agents.goal,
             events=result.events,
             traffic=traffic,
-            height=find_heights(step.scene, state.motion, boxes),
+            height=surrogate_safety.find_heights(step.scene, state.motion, boxes),
         )
         return _update(metrics, step, signals, route, ttc_limit_s=ttc_limit_s), frame
 
     return hook
-
-
-def find_heights(scene: Scene, motion: Motion, boxes: Boxes) -> Float[Array, " U"] | None:
-    """Heights of agents and traffic; None in a scene of one level."""
-    return None if scene.edges.height is None else jnp.concatenate([motion.position[:, 2], boxes.elevation])
 
 
 def _update(

@@ -19,8 +19,9 @@ from scenefactory_jax.core.pytree import replace
 from scenefactory_jax.core.schema import ConfigError
 from scenefactory_jax.core.track_interpolation import interpolate_track
 from scenefactory_jax.core.types import DRIVABLE, ROUTE_SPACING_M, AgentLog, Agents, Boxes, Motion, Scene, TrafficLog
+from scenefactory_jax.env import surrogate_safety
 from scenefactory_jax.env.step_metrics import StepMetricsConfig
-from scenefactory_jax.evaluation.episodes import EpisodeFrame, find_heights
+from scenefactory_jax.evaluation.episodes import EpisodeFrame
 from scenefactory_jax.evaluation.metrics import episode_metrics, episode_scores
 from scenefactory_jax.evaluation.metrics.episode_record import EpisodeRecord, Lanes, Lights, Others, Track, leave_out
 from scenefactory_jax.evaluation.metrics.episode_steps import StepMetrics, measure_steps
@@ -217,7 +218,7 @@ def collect_users(scene: Scene, start: Start, frames: EpisodeFrame, *, past_rows
     kind = scene.traffic_log.kind if follows_log else jnp.zeros(len(boxes.yaw), jnp.int32)
     columns = [jnp.concatenate(pair) for pair in zip(own, other, strict=True)]
     size, kinds = jnp.concatenate([start.agents.size, boxes.size]), jnp.concatenate([jnp.zeros(len(motion.yaw), jnp.int32), kind])
-    height = find_heights(scene, motion, boxes)
+    height = surrogate_safety.find_heights(scene, motion, boxes)
     if height is not None and frames.height is not None:  # before the start, that of the start
         height = jnp.concatenate([jnp.repeat(height[:, None], past_rows + 1, axis=1), frames.height.T], axis=1)
     return Others(columns[0], columns[1], columns[2], columns[3], size, kinds, height)

@@ -132,14 +132,14 @@ def put_networks(folder: Path | str, state: Any) -> tuple[Any, list[str]]:
     Raises:
         ConfigError: the policy's parameters do not fit, the message names the arrays that differ. Otherwise as `restore`.
     """
-    leaves, begin = _name_leaves(state), str.startswith
+    leaves = _name_leaves(state)
     policy = {f"{PARAMETERS}{name}": np.asarray(leaf) for name, leaf in _name_leaves(restore_parameters(folder)).items()}
-    _check_same_arrays(policy, {name: leaf for name, leaf in leaves.items() if begin(name, PARAMETERS)}, Path(folder))
+    _check_same_arrays(policy, {name: leaf for name, leaf in leaves.items() if name.startswith(PARAMETERS)}, Path(folder))
     found = {} if (Path(folder) / FILE).is_file() else _load(_find(folder, None), LEARNT)
-    describe = lambda arrays, path: {name: (leaf.shape, leaf.dtype) for name, leaf in arrays.items() if begin(name, path)}  # noqa: E731
-    paths = sorted({name.partition(NETWORK)[0] + NETWORK for name in leaves if begin(name, LEARNT) and NETWORK in name})
+    describe = lambda arrays, path: {name: (leaf.shape, leaf.dtype) for name, leaf in arrays.items() if name.startswith(path)}  # noqa: E731
+    paths = sorted({name.partition(NETWORK)[0] + NETWORK for name in leaves if name.startswith(LEARNT) and NETWORK in name})
     taken = [path for path in paths if describe(found, path) == describe(leaves, path)]
-    chosen = policy | {name: leaf for name, leaf in found.items() if begin(name, tuple(taken))}
+    chosen = policy | {name: leaf for name, leaf in found.items() if name.startswith(tuple(taken))}
     for name, value in policy.items():
         if (averaged := name.replace(PARAMETERS, AVERAGED, 1)) in leaves:
             chosen[averaged] = value

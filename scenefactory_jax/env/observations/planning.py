@@ -193,7 +193,7 @@ def _find_heights(
     scene: Scene, motion: Motion, users: surrogate_safety.RoadUsers
 ) -> tuple[Float[Array, " B"] | None, Float[Array, " B"] | None]:
     """Heights of road users and their vertical speeds on the road, m and m/s; None in a scene of one level."""
-    if scene.edges.height is None or scene.elevation is None:
+    height = surrogate_safety.find_heights(scene, motion, scene.traffic)
+    if height is None or scene.elevation is None:
         return None, None
-    height = jnp.concatenate([motion.position[:, 2], scene.traffic.elevation])
     return height, dot(elevation.find_ground(scene.elevation, users.position, height).slope, users.velocity)

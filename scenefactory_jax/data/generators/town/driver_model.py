@@ -86,8 +86,8 @@ def simulate(
     """Simulates all steps with constant accelerations within each step; `gates` are the states of stops and crosswalks.
 
     Args:
-        runs: road users that drive through closed gates; None: nobody.
-        turns: road users, and the gates that they treat as stop signs while closed; None: nobody.
+        runs: mask of the road users that do not stop at closed gates; None: all stop.
+        turns: mask of the gates that a road user passes while they are closed, after a stop as at a stop sign; None: none.
     """
     simulation = Simulation(users, driver)
     if runs is not None:
