@@ -1,12 +1,12 @@
-"""Train states on disk: a folder of checkpoints, one npz file for each saved iteration.
+"""Train states on disk: a folder of checkpoints, one npz file for each saved iteration, and its replay buffers in another beside it.
 
-A file has the arrays of a train state by their paths ("parameters/params/actor/trunk/layer_0/kernel"), random keys as their data, and no
+Buffers take gigabytes; without their file a policy is still evaluated and started from, but training does not go on. A file has the arrays of a train state by their paths ("parameters/params/actor/trunk/layer_0/kernel"), random keys as their data, and no
 empty arrays. It is written atomically. The checksums of its arrays (CRC-32, as in every zip file) are compared before anything is read.
 """
 
 import json
 import zipfile
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +20,7 @@ from scenefactory_jax.core import distributed, sharding
 from scenefactory_jax.core.atomic_file import write_atomically
 from scenefactory_jax.core.schema import ConfigError
 
-PARAMETERS, AVERAGED, LEARNT = "parameters/", "ema_parameters/", "learner/"  # paths of arrays begin with these
+PARAMETERS, AVERAGED, LEARNT, BUFFER = "parameters/", "ema_parameters/", "learner/", "buffer/"  # paths of arrays begin with these
 NETWORK = "/params/"  # behind the path of a network
 HOST = "host"  # JSON text of the values that the training loop adds
 FILE = "policy.npz"  # in place of checkpoints: parameters alone
@@ -49,14 +49,15 @@ def save(folder: Path | str, train_state: Any, *, keep: int, host: Mapping[str, 
     arrays |= {} if host is None else {HOST: np.array(json.dumps(host))}
     file.parent.mkdir(parents=True, exist_ok=True)
     try:
+        if buffers := {name: arrays.pop(name) for name in list(arrays) if name.startswith(BUFFER)}:
+            _write(_buffer_path(file), buffers)  # first: a checkpoint without its buffers would be the newest
         _write(file, arrays)
     except OSError as error:
         hint, newest = "there is no complete checkpoint", latest(folder)
         if newest is not None:
             hint = f"checkpoint {newest} is complete: with resume=true training goes on from it"
         raise OSError(error.errno, f"{error.strerror}; {hint}", str(file)) from None
-    for old in _list_iterations(folder)[:-keep]:
-        _path(folder, old).unlink()
+    _remove(folder, _list_iterations(folder)[:-keep])
     distributed.share(f"saved/{file.stem}", lambda: None)
     return file
 
@@ -70,8 +71,8 @@ def drop_training_state(folder: Path | str) -> None:
     """Removes all but the parameters of the newest checkpoint: for a run that will not be resumed."""
     *earlier, newest = _list_iterations(folder)
     _write(_path(folder, newest), _load(_path(folder, newest), PARAMETERS) | _load(_path(folder, newest), AVERAGED))
-    for iteration in earlier:
-        _path(folder, iteration).unlink()
+    _remove(folder, earlier)
+    _buffer_path(_path(folder, newest)).unlink(missing_ok=True)
 
 
 def restore(folder: Path | str, like: Any, iteration: int | None = None) -> Any:
@@ -88,7 +89,13 @@ def restore(folder: Path | str, like: Any, iteration: int | None = None) -> Any:
     stored = {name: value for name, value in _load(file).items() if name != HOST}
     if all(name.startswith((PARAMETERS, AVERAGED)) for name in stored):
         raise ConfigError(f"{file}: has parameters only; training cannot go on from it")
-    leaves = _name_leaves(like)
+    leaves, buffers = _name_leaves(like), _buffer_path(file)
+    if buffers.is_file():
+        if damage := _find_damage(buffers):
+            raise ConfigError(f"{buffers}: damaged: {damage}; restore it from a copy, or start_from this run")
+        stored |= _load(buffers)
+    elif any(name.startswith(BUFFER) for name in leaves) and not any(name.startswith(BUFFER) for name in stored):
+        raise ConfigError(f"{file}: {buffers.name} is not beside it, the replay buffer; training cannot go on, only start_from this run")
     _check_same_arrays(stored, {name: _to_data(leaf) for name, leaf in leaves.items() if leaf.size}, file)
     return jax.tree.unflatten(jax.tree.structure(like), [_place(stored.get(name), leaf) for name, leaf in leaves.items()])
 
@@ -158,6 +165,20 @@ def write_parameters(folder: Path | str, parameters: Any) -> Path:
 
 def _path(folder: Path | str, iteration: int) -> Path:
     return Path(folder) / f"{iteration}.npz"
+
+
+def _buffer_path(file: Path) -> Path:
+    """The file of a checkpoint's replay buffers."""
+    return file.with_suffix(".buffer.npz")
+
+
+def _remove(folder: Path | str, iterations: Iterable[int]) -> None:
+    """Removes checkpoints, and buffers without one: a save may have ended between the two files."""
+    for iteration in iterations:
+        _path(folder, iteration).unlink()
+    kept = {_buffer_path(_path(folder, iteration)) for iteration in _list_iterations(folder)}
+    for file in set(Path(folder).glob("*.buffer.npz")) - kept:
+        file.unlink()
 
 
 def _list_iterations(folder: Path | str) -> list[int]:

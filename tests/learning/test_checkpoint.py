@@ -248,6 +248,23 @@ def test_values_of_the_host_are_saved_with_it(saved, tmp_path):
     assert_same(checkpoint.restore(tmp_path, third, 3), third)
 
 
+def test_replay_buffers_have_their_own_file(saved, tmp_path):
+    _, third, fourth = saved
+    for state, start in ((third, 0.0), (fourth, 1.0)):
+        full = dataclasses.replace(state, buffer={"sac": {"rows": start + jnp.arange(4.0)}})
+        (tmp_path / "2.buffer.npz").write_bytes(b"")  # of a save that ended before its checkpoint
+        checkpoint.save(tmp_path, full, keep=1)
+    assert sorted(file.name for file in tmp_path.iterdir()) == ["4.buffer.npz", "4.npz"]
+    assert_same(checkpoint.restore(tmp_path, full), full)
+    put(tmp_path / "4.buffer.npz", (tmp_path / "4.buffer.npz").read_bytes().replace(np.float32(1.0).tobytes(), np.float32(7.0).tobytes()))
+    with pytest.raises(ConfigError, match="buffer.npz: damaged: buffer/sac/rows has changed"):
+        checkpoint.restore(tmp_path, full)
+    (tmp_path / "4.buffer.npz").unlink()
+    assert_same(checkpoint.restore_parameters(tmp_path), full.ema_parameters)
+    with pytest.raises(ConfigError, match=r"4.npz: 4.buffer.npz is not beside it, the replay buffer; training cannot go on"):
+        checkpoint.restore(tmp_path, full)
+
+
 def test_a_new_training_starts_from_the_networks_of_another(trainer, saved):
     folder, third, _ = saved
     new = trainer.init(jax.random.key(9), scenes(STAGE))
