@@ -1,7 +1,8 @@
 """Train states on disk: a folder of checkpoints, one npz file for each saved iteration, and its replay buffers in another beside it.
 
-Buffers take gigabytes; without their file a policy is still evaluated and started from, but training does not go on. A file has the arrays of a train state by their paths ("parameters/params/actor/trunk/layer_0/kernel"), random keys as their data, and no
-empty arrays. It is written atomically. The checksums of its arrays (CRC-32, as in every zip file) are compared before anything is read.
+Buffers take gigabytes; without their file a policy is still evaluated and started from, but training does not go on. A file has the
+arrays of a train state by their paths ("parameters/params/actor/trunk/layer_0/kernel"), random keys as their data, and no empty arrays.
+It is written atomically. The checksums of its arrays (CRC-32, as in every zip file) are compared before anything is read.
 """
 
 import json

@@ -67,8 +67,8 @@ def test_losses_of_sac_equal_their_definitions():
     raw = P * SEEN + 0.5 * NOISE
     action, density = np.tanh(raw)[:, 0], stats.norm.logpdf(raw, P * SEEN, 0.5)[:, 0] - np.log(1 - np.tanh(raw[:, 0]) ** 2)
     values = np.stack([1.5 * (SEEN[:, 0] + action), -0.5 * (SEEN[:, 0] - action)])
-    total, metrics = sac_loss.compute_actor_loss(P, C, {"x": SEEN}, NOISE, alpha=jnp.float32(0.2), **SUMS)
-    expected = np.mean((0.2 * density - values.min(0))[:2])  # the third sample has no weight
+    total, metrics = sac_loss.compute_actor_loss(P, C, {"x": SEEN}, NOISE, alpha=jnp.float32(0.2), raw_penalty=0.1, **SUMS)
+    expected = np.mean((0.2 * density - values.min(0) + 0.1 * (P * SEEN[:, 0]) ** 2)[:2])  # the third sample has no weight
     np.testing.assert_allclose([total, metrics["entropy"]], [expected, -density[:2].mean()], rtol=1e-5)
 
     target = sac_loss.compute_target(
@@ -91,8 +91,11 @@ def test_losses_of_td3_equal_their_definitions():
     values = jnp.array([[1.0, 5.0], [2.0, 4.0]])
     target = td3_loss.compute_target(jnp.array([0.5, 0.5]), jnp.array([1.0, 0.0]), values, gamma=0.9)
     np.testing.assert_allclose(target, [0.5 + 0.9 * 1.0, 0.5])
-    total, _ = td3_loss.compute_actor_loss(P, C, {"x": SEEN}, **SUMS)
-    np.testing.assert_allclose(total, -np.mean(1.5 * (SEEN + np.tanh(P * SEEN))[:2]), rtol=1e-6)
+    total, _ = td3_loss.compute_actor_loss(P, C, {"x": SEEN}, raw_penalty=0.1, **SUMS)
+    np.testing.assert_allclose(total, np.mean((0.1 * (P * SEEN) ** 2 - 1.5 * (SEEN + np.tanh(P * SEEN)))[:2]), rtol=1e-6)
+    slope = jax.grad(lambda p, penalty: td3_loss.compute_actor_loss(p, C, {"x": SEEN}, raw_penalty=penalty, **SUMS)[0])
+    saturated = jnp.float32(100.0)  # tanh has no slope there: only the penalty leads the actor back
+    assert float(slope(saturated, 0.0)) == 0.0 and float(slope(saturated, 1e-3)) > 0.0
 
 
 def test_losses_of_cloning_equal_their_definitions():

@@ -76,13 +76,14 @@ REPLAY = dict(
     stagger_episodes=False,
 )
 CRITICS = dict(learning_rate=1e-2, critic_learning_rate=1e-2, gamma=0.9, tau=0.05)
-SOFT = dict(actor="tanh_gaussian", alpha=0.01, entropy_target=None, alpha_learning_rate=1e-2)
+SOFT = dict(actor="tanh_gaussian", alpha=0.01, entropy_target=None, alpha_learning_rate=1e-2, raw_penalty=0.0)
 EXPERT = dict(expert={}, expert_noise=dict(std=[0.0, 0.0, 0.0], time_s=1.0, part=0.0), samples=None)
 LEARNERS = {
     "sac": REPLAY | CRITICS | SOFT,
     "td3": REPLAY
     | CRITICS
-    | dict(actor="deterministic", learning_rate=3e-3, exploration_std=0.3, target_noise_std=0.1, target_noise_clip=0.2, policy_delay=2),
+    | dict(actor="deterministic", learning_rate=3e-3, exploration_std=0.3, target_noise_std=0.1, target_noise_clip=0.2, policy_delay=2)
+    | dict(raw_penalty=1e-3),
     "bc": REPLAY | EXPERT | dict(actor="tanh_gaussian", learning_rate=1e-2, loss="squared_error"),
     "bc_sac": REPLAY
     | CRITICS

@@ -19,6 +19,7 @@ class SACConfig(OffPolicyConfig):
     alpha: NonNegative  # weight of the entropy, at the beginning
     entropy_target: float | None  # nats for each number of an action, to which alpha is tuned; None: alpha is constant
     alpha_learning_rate: Positive
+    raw_penalty: NonNegative  # weight of the squared means before the tanh in the actor's loss
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -17,10 +17,9 @@ from scenefactory_jax.learning.networks.squashed import Networks
 
 
 def sample_action(
-    networks: Networks, parameters: Any, observation: Observation, noise: Float[Array, "*batch D"]
+    mean: Float[Array, "*batch D"], std: Float[Array, "*batch D"], noise: Float[Array, "*batch D"]
 ) -> tuple[Float[Array, "*batch D"], Float[Array, "*batch"]]:
     """Computes the actions of standard normal noise, and the logarithms of their densities."""
-    mean, std = networks.distribution(parameters, observation)
     raw = mean + std * noise
     return jnp.tanh(raw), gaussian.squashed_log_probability(raw, mean, std)
 
@@ -51,15 +50,17 @@ def compute_actor_loss(
     weight: Float[Array, "*batch"],
     *,
     alpha: Float[Array, ""],
+    raw_penalty: float,
     networks: Networks,
     total: Array,
 ) -> tuple[Float[Array, ""], dict[str, Float[Array, ""]]]:
-    """Computes the mean of alpha log pi - min Q, of actions of the noise."""
-    action, log_probability = sample_action(networks, parameters, observation, noise)
+    """Computes the mean of alpha log pi - min Q, of actions of the noise, and of the penalty on means before the tanh."""
+    mean, std = networks.distribution(parameters, observation)
+    action, log_probability = sample_action(mean, std, noise)
     value = jnp.min(networks.critic.apply(critics, observation, action), axis=0)
-    mean = functools.partial(partial_mean, weight=weight, total=total)
-    loss = mean(alpha * log_probability - value)
-    return loss, jax.lax.stop_gradient({"actor_loss": loss, "entropy": -mean(log_probability)})
+    average = functools.partial(partial_mean, weight=weight, total=total)
+    loss = average(alpha * log_probability - value + raw_penalty * jnp.sum(mean**2, axis=-1))
+    return loss, jax.lax.stop_gradient({"actor_loss": loss, "entropy": -average(log_probability)})
 
 
 def compute_alpha_loss(

@@ -93,13 +93,13 @@ def update(sac: SAC, learnt: Learnt, rows: dict[str, Any], weight: Float[Array, 
     noise, next_noise = (rollout.sample_noise(one, rows["action"], axis) for one in jax.random.split(key))
     total, alpha = sharding.sum_over_devices(jnp.sum(weight), axis), jnp.exp(log_alpha)
 
-    following = loss.sample_action(networks, learnt.parameters, rows["next_observation"], next_noise)
+    following = loss.sample_action(*networks.distribution(learnt.parameters, rows["next_observation"]), next_noise)
     values = networks.critic.apply(target, rows["next_observation"], following[0])
     aim = loss.compute_target(rows["reward"], rows["follows"] * 1.0, values, following[1], alpha=alpha, gamma=config.gamma)
     of_critics = functools.partial(compute_critic_loss, rows=rows, target=aim, weight=weight, networks=networks, total=total)
     moved, critic_state, metrics = off_policy.descend(of_critics, critic_adam, critics, states.critics, axis)
 
-    constants = {"observation": rows["observation"], "noise": noise, "weight": weight, "total": total}
+    constants = {"observation": rows["observation"], "noise": noise, "weight": weight, "total": total, "raw_penalty": config.raw_penalty}
     of_actor = functools.partial(loss.compute_actor_loss, critics=critics, alpha=alpha, networks=networks, **constants)
     parameters, actor_state, found = off_policy.descend(of_actor, actor_adam, learnt.parameters, states.actor, axis)
     changed = metrics["changed"] & found["changed"]

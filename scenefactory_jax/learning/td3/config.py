@@ -20,3 +20,4 @@ class TD3Config(OffPolicyConfig):
     target_noise_std: NonNegative  # of the noise on the actions in the critics' target
     target_noise_clip: NonNegative  # bound of this noise
     policy_delay: Count  # updates of the critics for one of the actor and the target networks
+    raw_penalty: NonNegative  # weight of the squared numbers before the tanh in the actor's loss

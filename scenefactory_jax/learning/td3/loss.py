@@ -40,9 +40,17 @@ def compute_target(
 
 
 def compute_actor_loss(
-    parameters: Any, critics: Any, observation: Observation, weight: Float[Array, "*batch"], *, networks: Networks, total: Array
+    parameters: Any,
+    critics: Any,
+    observation: Observation,
+    weight: Float[Array, "*batch"],
+    *,
+    raw_penalty: float,
+    networks: Networks,
+    total: Array,
 ) -> tuple[Float[Array, ""], dict[str, Float[Array, ""]]]:
-    """Computes the mean of -Q of the first critic; on several devices, each device's summand of it."""
-    value = networks.critic.apply(critics, observation, choose_action(networks, parameters, observation))[0]
-    loss = -partial_mean(value, weight=weight, total=total)
+    """Computes the mean of -Q of the first critic and of the penalty on numbers before the tanh; on several devices, a device's summand."""
+    raw = networks.distribution(parameters, observation)[0]
+    value = networks.critic.apply(critics, observation, jnp.tanh(raw))[0]
+    loss = partial_mean(raw_penalty * jnp.sum(raw**2, axis=-1) - value, weight=weight, total=total)
     return loss, jax.lax.stop_gradient({"actor_loss": loss})

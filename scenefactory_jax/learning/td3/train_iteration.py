@@ -108,7 +108,7 @@ def update(td3: TD3, learnt: Learnt, rows: dict[str, Any], weight: Float[Array, 
 def update_actor(td3: TD3, observation: Observation, weight: Float[Array, "G B"], total: Array, learnt: Learnt) -> tuple[Learnt, Metrics]:
     """Makes one step of the actor and of the target networks; metrics count `policy_delay` times, as means are over all updates."""
     config, learner, delay = td3.config, learnt.learner, td3.config.policy_delay
-    constants = {"observation": observation, "weight": weight, "total": total}
+    constants = {"observation": observation, "weight": weight, "total": total, "raw_penalty": config.raw_penalty}
     objective = functools.partial(loss.compute_actor_loss, critics=learner.critics, networks=td3.networks, **constants)
     parameters, state, found = off_policy.descend(objective, td3.optimizers[0], learnt.parameters, learnt.optimizer.actor, td3.axis)
     pairs = (learner.target, learner.critics), (learner.target_actor, parameters)
