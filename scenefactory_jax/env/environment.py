@@ -33,6 +33,7 @@ from scenefactory_jax.core.types import (
     Traffic,
     Weather,
 )
+from scenefactory_jax.dynamics.collision import collect_boxes
 from scenefactory_jax.env import history, observations, rewards, route_following, spawning, step_metrics, termination, traffic
 from scenefactory_jax.env.history import HistorySpec
 from scenefactory_jax.roadgraph import elevation
@@ -336,7 +337,7 @@ def _hold_action(parts: EnvParts, state: State, action: Float[Array, "A 3"]) -> 
 def _advance(parts: EnvParts, scene: Scene, state: State, action: Float[Array, "A 3"]) -> State:
     body = parts.dynamics.advance(scene, state.body, action, state.active)
     motion = parts.dynamics.read(body)
-    cars = spawning.make_boxes(state.motion, state.agents, state.active)
+    cars = collect_boxes(state.motion, state.agents.size, state.active, jnp.inf)
     return replace(
         state,
         body=body,
