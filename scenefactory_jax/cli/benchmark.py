@@ -87,11 +87,7 @@ def benchmark(
 
 
 def _read(out: Path | None) -> dict[str, Any]:
-    """Reads the result of an earlier benchmark in the folder.
-
-    Raises:
-        ConfigError: there is no folder, or nothing in it.
-    """
+    """Reads the result of an earlier benchmark in the folder; ConfigError: there is no folder, or nothing in it."""
     if out is None or not (out / FILE).is_file():
         raise ConfigError(f"resume=true: out={out}: no {FILE} to go on with; expected the folder of a stopped benchmark")
     return result_file.read(out / FILE)

@@ -77,11 +77,7 @@ def _format_help(name: str, overrides: Sequence[str], about: str) -> str:
 
 
 def _check_sweep(name: str, overrides: Sequence[str]) -> set[str]:
-    """Checks the keys of a sweep before Hydra does, and that no two of its jobs evaluate into one folder.
-
-    Returns:
-        The keys that vary.
-    """
+    """Checks the keys of a sweep before Hydra does, and that no two of its jobs evaluate into one folder; returns the keys that vary."""
     first, varied = configs.sweep(overrides)
     out = next((word for word in overrides if word.startswith("out=")), "")
     separate = "${" in out or "out" in varied or (not out and varied <= {"run"})

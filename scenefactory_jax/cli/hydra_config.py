@@ -104,11 +104,7 @@ def load_each(name: str, *overrides: str, key: str, values: Sequence[Any]) -> li
 
 
 def _open(name: str, overrides: Sequence[str], *, whole: bool = False) -> Any:
-    """Composes a config without resolving references; `whole`: with Hydra's own part and missing values.
-
-    Raises:
-        ConfigError: see `load_config`.
-    """
+    """Composes a config without resolving references; `whole`: with Hydra's own part and missing values; errors as of `load_config`."""
     find_config(name)
     try:
         opened = _compose(name, overrides, whole=whole)

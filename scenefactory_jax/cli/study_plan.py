@@ -276,11 +276,7 @@ def _plan_row(
     *,
     folder: Path,
 ) -> Iterator[Evaluation]:
-    """The evaluations of one row under some conditions.
-
-    Args:
-        folder: of the records.
-    """
+    """The evaluations of one row under some conditions; `folder`: of the records."""
     for condition, judged in protocols.items():
         try:
             settings = configs.apply_overrides(training.config, [*judged.overrides, *overrides])

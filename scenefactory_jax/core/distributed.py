@@ -71,7 +71,8 @@ def join(settings: Distributed) -> Iterator[None]:
             stopped = signal
         STATE.client.wait_at_barrier("end", FOREVER_MS)
     except BaseException as error:
-        if _is_lost_peer(error):
+        if isinstance(error, ValueError | RuntimeError) and any(word in str(error) for word in ("Gloo", "NCCL", "onnection")):
+            # a collective operation broke off because another process has ended
             time.sleep(settings.timeout_s + 2 * MAX_BEAT_S)  # the watch finds out which one, and ends this process
             error = ConfigError(f"distributed: the network or another process failed: {_shorten(error)}; {HINT}")
         ended.set()
@@ -166,7 +167,7 @@ def _watch(timeout_s: float, ended: threading.Event) -> None:
     """
     client, me, beat = STATE.client, STATE.process_id, 0
     seen = {f"alive/{number}": ("", time.monotonic()) for number in range(STATE.num_processes)}  # last sign and its time
-    while not ended.wait(_beat_s(timeout_s)):
+    while not ended.wait(min(timeout_s / BEATS, MAX_BEAT_S)):
         beat += 1
         try:
             client.key_value_set(f"alive/{me}", str(beat), allow_overwrite=True)
@@ -202,15 +203,6 @@ def _linger() -> None:
     """The first process stays until the others have read why all end."""
     if is_first():
         time.sleep(LINGER_S)
-
-
-def _beat_s(timeout_s: float) -> float:
-    return min(timeout_s / BEATS, MAX_BEAT_S)
-
-
-def _is_lost_peer(error: BaseException) -> bool:
-    """Whether a collective operation broke off because another process has ended."""
-    return isinstance(error, ValueError | RuntimeError) and any(word in str(error) for word in ("Gloo", "NCCL", "onnection"))
 
 
 def _shorten(error: BaseException) -> str:

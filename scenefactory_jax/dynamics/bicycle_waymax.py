@@ -127,27 +127,6 @@ def compute_inverse_action(
     return acceleration, jnp.where(standing, 0.0, curvature)
 
 
-def compute_expert_actions(
-    yaw: Float[Array, "A L"],
-    velocity: Float[Array, "A L 2"],
-    valid: Bool[Array, "A L"],
-    *,
-    dt: float | Float[Array, ""],
-    acceleration: float,
-    curvature: float,
-) -> tuple[Float[Array, "A M 2"], Bool[Array, "A M"]]:
-    """Computes the normalised actions between the steps of logged tracks, clipped to [-1, 1], and a mask of those between valid steps.
-
-    Args:
-        dt: time step of the log, s.
-        acceleration, curvature: of an action of 1, as in `make`.
-    """
-    push, bend = compute_inverse_action(yaw[:, :-1], velocity[:, :-1], yaw[:, 1:], velocity[:, 1:], dt=dt)
-    action = jnp.clip(jnp.stack([push / acceleration, bend / curvature], axis=-1), -1.0, 1.0)
-    valid = valid[:, :-1] & valid[:, 1:]
-    return jnp.where(valid[..., None], action, 0.0), valid
-
-
 def read(body: Body, *, height: float, wheelbase: float) -> Motion:
     """Reads the motion of the cars."""
     zero = jnp.zeros_like(body.yaw)

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from scenefactory_jax.core.instantiate import instantiate
-from scenefactory_jax.core.types import Dynamics, Scene, Weather
+from scenefactory_jax.core.types import Dynamics, Scene
 from scenefactory_jax.dynamics import mujoco_c, open_ground
 from scenefactory_jax.dynamics.articulated.parameters import read_parameters
 
@@ -48,9 +48,10 @@ def compare_solvers(
     size = (car.length, car.width)
     scenes = open_ground.make_open_ground(np.zeros((drives, 1, 2)), zero, speed[:, None], mu, np.zeros(drives, np.int32), size=size)
     times = {"physics_dt": 1.0 / physics_hz, "control_dt": 1.0 / control_hz}
+    read_mu = lambda weather, position, speed: jnp.broadcast_to(weather.film_mm, speed.shape)  # where `open_ground` keeps it  # noqa: E731
     paths = {}
     for name, entry in backends.items():
-        backend = instantiate(entry, builtins="scenefactory_jax.dynamics", where="dynamics", friction=_read_mu, **times)()
+        backend = instantiate(entry, builtins="scenefactory_jax.dynamics", where="dynamics", friction=read_mu, **times)()
         paths[name] = np.asarray(_simulate(backend)(scenes, jnp.asarray(actions[:, :, None])), float)
     paths[REFERENCE] = np.stack([
         mujoco_c.simulate(
@@ -62,11 +63,6 @@ def compare_solvers(
     names = list(paths)
     pairs = [(first, second) for i, first in enumerate(names) for second in names[i + 1 :]]
     return {pair: np.linalg.norm(paths[pair[0]] - paths[pair[1]], axis=-1).max(1) for pair in pairs}
-
-
-def _read_mu(weather: Weather, position: Array, speed: Array) -> Array:
-    """Reads the friction coefficient that `open_ground` stores as the film."""
-    return jnp.broadcast_to(weather.film_mm, speed.shape)
 
 
 def _simulate(backend: Dynamics) -> Callable[[Scene, Array], Array]:

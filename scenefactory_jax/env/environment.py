@@ -33,6 +33,7 @@ from scenefactory_jax.core.types import (
     Traffic,
     Weather,
 )
+from scenefactory_jax.dynamics.collision import collect_boxes
 from scenefactory_jax.env import history, observations, rewards, route_following, spawning, step_metrics, termination, traffic
 from scenefactory_jax.env.history import HistorySpec
 from scenefactory_jax.roadgraph import elevation
@@ -336,7 +337,7 @@ def _hold_action(parts: EnvParts, state: State, action: Float[Array, "A 3"]) -> 
 def _advance(parts: EnvParts, scene: Scene, state: State, action: Float[Array, "A 3"]) -> State:
     body = parts.dynamics.advance(scene, state.body, action, state.active)
     motion = parts.dynamics.read(body)
-    cars = spawning.make_boxes(state.motion, state.agents, state.active)
+    cars = collect_boxes(state.motion, state.agents.size, state.active, jnp.inf)
     return replace(
         state,
         body=body,
@@ -356,15 +357,11 @@ def _advance(parts: EnvParts, scene: Scene, state: State, action: Float[Array, "
 def _restore_non_finite(metrics: StepMetrics, before: State, after: State) -> tuple[StepMetrics, State]:
     """Restores a car whose motion is not finite to its state before the step, with a zero action: its NaN values do not propagate."""
     error = metrics.events.numerical_error
-    clean = StepMetrics(**{name: _without_nan(value) for name, value in vars(metrics).items() if name != "events"}, events=metrics.events)
+    numbers = {name: value for name, value in vars(metrics).items() if name != "events" and value.dtype != bool}
+    clean = replace(metrics, **{name: jnp.where(jnp.isnan(value), 0.0, value) for name, value in numbers.items()})  # inf: no TTC
     body, motion = tree_where(error, (before.body, before.motion), (after.body, after.motion))
     action = jnp.where(error[:, None], 0.0, after.previous_action)  # it may be the value that was not finite
     return clean, replace(after, body=body, motion=motion, previous_action=action)
-
-
-def _without_nan(value: Array) -> Array:
-    """Replaces NaN by zero; infinities keep their meaning (no TTC)."""
-    return value if value.dtype == bool else jnp.where(jnp.isnan(value), 0.0, value)
 
 
 def _respawn(parts: EnvParts, scene: Scene, state: State, *, clear_m: float) -> State:

@@ -20,7 +20,7 @@ from scenefactory_jax.core.geometry import (
 from scenefactory_jax.core.instantiate import check_range, instantiate
 from scenefactory_jax.core.pytree import is_finite, replace, tree_where
 from scenefactory_jax.core.schema import Bounds, ConfigError, Count, Fraction, NonNegative, Positive, Range, check_names
-from scenefactory_jax.core.types import ROUTE_SPACING_M, Agents, Boxes, Motion, Scene
+from scenefactory_jax.core.types import ROUTE_SPACING_M, Agents, Boxes, Scene
 from scenefactory_jax.env import route_following
 
 Sampler = Callable[[PRNGKeyArray, Scene], Agents]
@@ -272,20 +272,6 @@ def _pick(candidates: Float[Array, "A C *d"], *, chosen: Int[Array, " A"], prese
     pad = (1,) * (candidates.ndim - 2)
     picked = jnp.take_along_axis(candidates, chosen.reshape((-1, 1, *pad)), axis=1)[:, 0]
     return jnp.where(present.reshape((-1, *pad)), picked, 0.0).astype(jnp.float32)
-
-
-def make_boxes(motion: Motion, agents: Agents, active: Bool[Array, " A"]) -> Boxes:
-    """Makes the boxes of active agents, as background traffic sees them."""
-    return Boxes(
-        position=motion.position[:, :2],
-        elevation=motion.position[:, 2],
-        yaw=motion.yaw,
-        velocity=motion.velocity[:, :2],
-        yaw_rate=motion.yaw_rate,
-        size=agents.size,
-        mass=jnp.full_like(motion.yaw, jnp.inf),
-        present=active,
-    )
 
 
 def is_clear(

@@ -58,7 +58,8 @@ def compute(scene: Scene, before: State, after: State, *, config: StepMetricsCon
     Definitions follow the paper (arXiv:2605.08528, section 4): planar goal distance; nearest lane midpoint of the whole world, its tangent
     turned towards the goal; TTC and DRAC with active cars and with boxes; contact of the bounding circles with road edges.
     """
-    motion, active, cars, broken = after.motion, before.active, len(before.active), _find_non_finite(after)
+    motion, active, cars = after.motion, before.active, len(before.active)
+    broken = ~(is_finite(motion) & spawning.find_usable(after.agents))
     position, velocity = motion.position[:, :2], motion.velocity[:, :2]
     users = surrogate_safety.collect_road_users(motion, after.agents.size, active & ~broken, scene.traffic)
     centres, radius = cover_with_circles(users.position, users.yaw, users.size, **vars(config.circles))
@@ -108,11 +109,6 @@ def _is_route_driven(after: State, goal_radius_m: float) -> Bool[Array, " A"]:
     """Whether an agent's way along its route is at its goal, which a route that crosses itself passes earlier; true without a route."""
     agents = after.agents
     return (agents.route_end <= agents.route_start) | (after.route.arc >= agents.route_end - 2 * goal_radius_m)
-
-
-def _find_non_finite(state: State) -> Bool[Array, " A"]:
-    """Agents whose motion, start or goal has a number that is not finite."""
-    return ~(is_finite(state.motion) & spawning.find_usable(state.agents))
 
 
 def _is_out_of_bounds(

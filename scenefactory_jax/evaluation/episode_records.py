@@ -94,7 +94,11 @@ def make_episode_runner(
             values, failing = score(batch, start, driven.frames)
             records |= {name: column[here] for name, column in values.items()}
         rollouts = realism.read_rollouts(driven.frames) if realism and driven.frames is not None else None
-        recording = _make_recording(driven, batch, scenes.names, config, worlds, failing) if worlds and repeat == 0 else None
+        recording = None
+        if worlds and repeat == 0:
+            frames = jax.tree.map(lambda leaf: leaf[:worlds], driven.frames)
+            numbers = control_hz, float(config["step_metrics"]["goal_radius_m"])
+            recording = Recording(batch, frames, driven.last, driven.first.weather, list(scenes.names), *numbers, failing)
         return records | {"world": records["world"] + repeat * count}, recording, rollouts
 
     def run(parameters: Any) -> Run:
@@ -116,14 +120,6 @@ def _spread_scenes(columns: Mapping[str, np.ndarray], world: np.ndarray) -> dict
         has_value = worlds < len(column)  # the first repeat
         spread[name][first[has_value]] = column[worlds[has_value]]
     return spread
-
-
-def _make_recording(
-    driven: "_Driven", batch: Scene, names: Sequence[str], config: Mapping[str, Any], worlds: int, failing: dict[str, np.ndarray] | None
-) -> Recording:
-    recorded = jax.tree.map(lambda leaf: leaf[:worlds], driven.frames)
-    numbers = float(config["timing"]["control_hz"]), float(config["step_metrics"]["goal_radius_m"])
-    return Recording(batch, recorded, driven.last, driven.first.weather, list(names), *numbers, failing)
 
 
 class _Driven(NamedTuple):

@@ -43,7 +43,7 @@ def save(folder: Path | str, train_state: Any, *, keep: int, host: Mapping[str, 
     if keep < 1:
         raise ConfigError(f"keep: expected an integer >= 1, got {keep}")
     file = _path(folder, int(train_state.iteration))
-    arrays: Arrays = sharding.fetch({name: _to_data(leaf) for name, leaf in _name_leaves(train_state).items() if leaf.size})
+    arrays: Arrays = sharding.fetch({name: _to_data(leaf) for name, leaf in name_leaves(train_state).items() if leaf.size})
     if not distributed.is_first():
         distributed.share(f"saved/{file.stem}", lambda: None)
         return file
@@ -90,7 +90,7 @@ def restore(folder: Path | str, like: Any, iteration: int | None = None) -> Any:
     stored = {name: value for name, value in _load(file).items() if name != HOST}
     if all(name.startswith((PARAMETERS, AVERAGED)) for name in stored):
         raise ConfigError(f"{file}: has parameters only; training cannot go on from it")
-    leaves, buffers = _name_leaves(like), _buffer_path(file)
+    leaves, buffers = name_leaves(like), _buffer_path(file)
     if buffers.is_file():
         if damage := _find_damage(buffers):
             raise ConfigError(f"{buffers}: damaged: {damage}; restore it from a copy, or start_from this run")
@@ -140,8 +140,8 @@ def put_networks(folder: Path | str, state: Any) -> tuple[Any, list[str]]:
     Raises:
         ConfigError: the policy's parameters do not fit, the message names the arrays that differ. Otherwise as `restore`.
     """
-    leaves = _name_leaves(state)
-    policy = {f"{PARAMETERS}{name}": np.asarray(leaf) for name, leaf in _name_leaves(restore_parameters(folder)).items()}
+    leaves = name_leaves(state)
+    policy = {f"{PARAMETERS}{name}": np.asarray(leaf) for name, leaf in name_leaves(restore_parameters(folder)).items()}
     _check_same_arrays(policy, {name: leaf for name, leaf in leaves.items() if name.startswith(PARAMETERS)}, Path(folder))
     found = {} if (Path(folder) / FILE).is_file() else _load(_find(folder, None), LEARNT)
     describe = lambda arrays, path: {name: (leaf.shape, leaf.dtype) for name, leaf in arrays.items() if name.startswith(path)}  # noqa: E731
@@ -160,7 +160,7 @@ def put_networks(folder: Path | str, state: Any) -> tuple[Any, list[str]]:
 def write_parameters(folder: Path | str, parameters: Any) -> Path:
     """Writes parameters to one compressed file of the folder, which `restore_parameters` reads."""
     file = Path(folder) / FILE
-    _write(file, jax.device_get(_name_leaves(parameters)), savez=np.savez_compressed)
+    _write(file, jax.device_get(name_leaves(parameters)), savez=np.savez_compressed)
     return file
 
 
@@ -238,7 +238,7 @@ def _check_same_arrays(stored: Mapping[str, Any], expected: Mapping[str, Any], f
     raise ConfigError(f"{file} does not fit this config: {'; '.join(lines)}{more}; use the settings of the run, or another folder")
 
 
-def _name_leaves(tree: Any) -> dict[str, Any]:
+def name_leaves(tree: Any) -> dict[str, Any]:
     """Path -> leaf, in the order of the leaves."""
     return {jax.tree_util.keystr(path, simple=True, separator="/"): leaf for path, leaf in jax.tree_util.tree_leaves_with_path(tree)}
 

@@ -18,7 +18,8 @@ from scenefactory_jax.core.pytree import replace
 from scenefactory_jax.core.schema import ConfigError
 from scenefactory_jax.core.track_interpolation import SNAP
 from scenefactory_jax.core.types import AgentLog, Agents, Boxes, Env, Observation, Policy, Scene, State
-from scenefactory_jax.env import environment, route_following, spawning, termination
+from scenefactory_jax.dynamics.collision import collect_boxes
+from scenefactory_jax.env import environment, route_following, termination
 from scenefactory_jax.env.environment import EnvParts
 from scenefactory_jax.env.traffic.idm import SIDE_M
 from scenefactory_jax.env.traffic.log_playback import VEHICLE, is_parked
@@ -219,7 +220,7 @@ def advance(
 def read_boxes(state: VehicleState, logged: Boxes, *, stays: bool) -> Boxes:
     """Reads the boxes of the vehicles that the policy drives, and of the others from their log; `stays`: also of those that ended."""
     active = state.world.active
-    own = spawning.make_boxes(state.world.motion, state.world.agents, active | (state.ended & stays))
+    own = collect_boxes(state.world.motion, state.world.agents.size, active | (state.ended & stays), jnp.inf)
     own = replace(
         own,
         velocity=jnp.where(active[:, None], own.velocity, 0.0),

@@ -23,6 +23,7 @@ from scenefactory_jax.core.types import Env, Scene
 from scenefactory_jax.data.loading import scene_source, stream
 from scenefactory_jax.env import environment
 from scenefactory_jax.learning import off_policy, replay_buffer, rollout, sample_files, trainer
+from scenefactory_jax.learning.checkpoint import name_leaves
 from scenefactory_jax.learning.expert import Noise, make_disturbance, make_expert
 from scenefactory_jax.learning.networks.squashed import FULL
 from scenefactory_jax.learning.rollout import Act, Disturb, Worlds
@@ -135,7 +136,7 @@ def drive_scenes(config: Mapping[str, Any], env: Env, run: Callable[..., Any], s
                         break
                     continue
                 origin = (placed[chosen[1]], chosen[2], chosen[0] + time)
-                named = {name: leaf[chosen] for name, leaf in sample_files.name_rows(rows).items()}
+                named = {name: leaf[chosen] for name, leaf in name_leaves(rows).items()}
                 yield named | {name: value.astype(np.int32) for name, value in zip(ORIGIN, origin, strict=True)}
 
 

@@ -12,7 +12,6 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 
@@ -40,11 +39,6 @@ class Index(NamedTuple):
 def describe_config(config: Mapping[str, Any]) -> dict[str, Any]:
     """The part of a config in which a run must be as the recording."""
     return result_file.plain({name: config[name] for name in GROUPS} | {"timing": {RATE: config["timing"][RATE]}}, digits=None)
-
-
-def name_rows(rows: Any) -> dict[str, Any]:
-    """Path -> array of a pytree of rows, in the order of its leaves."""
-    return {jax.tree_util.keystr(path, simple=True, separator="/"): leaf for path, leaf in jax.tree_util.tree_leaves_with_path(rows)}
 
 
 def write_chunk(folder: Path, number: int, arrays: Arrays) -> None:

@@ -19,6 +19,7 @@ from jaxtyping import Array, Bool
 from scenefactory_jax.core import result_file, sharding
 from scenefactory_jax.core.schema import ConfigError
 from scenefactory_jax.learning import sample_files
+from scenefactory_jax.learning.checkpoint import name_leaves
 from scenefactory_jax.learning.sample_files import Arrays, Index
 from scenefactory_jax.learning.trainer import Trainer, TrainState
 
@@ -75,7 +76,7 @@ def open_stream(
     folder, learner = Path(config["learner"]["samples"]), config["learner"]
     index, rings = sample_files.read_index(folder), train_state.buffer[trainer.recorded].rows
     row = jax.tree.map(lambda leaf: jax.ShapeDtypeStruct(leaf.shape[2:], leaf.dtype), rings)
-    expected = sample_files.name_rows(row)
+    expected = name_leaves(row)
     sample_files.check_fit(folder, index, config, expected)
     groups, capacity = jax.tree.leaves(rings)[0].shape[:2]
     shares = [-(-rows // groups) for rows in index.rows]  # samples of a chunk in each group

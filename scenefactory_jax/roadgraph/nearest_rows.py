@@ -68,8 +68,10 @@ def find_nearest(squared: Float[Array, "A P"], *, count: int) -> tuple[Int[Array
     Returns:
         Indices, and a mask of those that exist.
     """
+    if squared.shape[1] == 0:
+        return jnp.zeros((len(squared), count), jnp.int32), jnp.zeros((len(squared), count), bool)
     if count >= squared.shape[1]:
-        return find_first_true(jnp.isfinite(squared), count=count) if squared.shape[1] else _find_none(squared.shape[0], count)
+        return find_first_true(jnp.isfinite(squared), count=count)
     largest = jnp.max(jnp.where(jnp.isfinite(squared), squared, 0.0), axis=1)
 
     def narrow(_: Any, bounds: tuple[Array, Array]) -> tuple[Array, Array]:
@@ -82,10 +84,6 @@ def find_nearest(squared: Float[Array, "A P"], *, count: int) -> tuple[Int[Array
 
     low, width = jax.lax.fori_loop(0, PASSES, narrow, (jnp.zeros_like(largest), 1.000001 * largest + 1e-6))
     return find_first_true(squared <= (low + width)[:, None], count=count)
-
-
-def _find_none(rows: int, count: int) -> tuple[Int[Array, "A K"], Bool[Array, "A K"]]:
-    return jnp.zeros((rows, count), jnp.int32), jnp.zeros((rows, count), bool)
 
 
 def select_nearest(squared: Float[Array, "A P"], *, count: int) -> tuple[Int[Array, "A K"], Bool[Array, "A K"]]:

@@ -56,13 +56,17 @@ def identify(config: Mapping[str, Any], out: Path) -> dict[str, Any]:
         "fitted": config,
         "published": {**config, "dynamics": config["others"]["published"], "sysid": {**settings, "space": settings["published_space"]}},
     }
-    _check_tuned(settings, [name for structure in structures.values() for name in structure["sysid"]["space"]])
+    valid = dict.fromkeys(name for structure in structures.values() for name in structure["sysid"]["space"])
+    for name, entry in settings["stages"].items():
+        if unknown := [parameter for parameter in entry["tuned"] if parameter not in valid]:
+            raise ConfigError(f"sysid.stages.{name}.tuned: {unknown[0]!r}; valid: {', '.join(valid)}")
     suites = record_suites(config, out)
     batch = candidate_simulation.stack_recordings([recording for recordings in suites.values() for recording in recordings])
     fits = {name: fit(structure, out / "stages" / name, suites, batch) for name, structure in structures.items()}
     cars = {name: (fit.simulator, fit.refined.best) for name, fit in fits.items()}
     cars = {"fitted": cars["fitted"], "start": (fits["fitted"].simulator, fits["fitted"].space.start), "published": cars["published"]}
-    errors, responses, traces = {}, {"teacher": measure_teacher(suites)}, {}
+    measured = {suite: response_metrics.measure_recordings(recordings)._asdict() for suite, recordings in suites.items()}
+    errors, responses, traces = {}, {"teacher": measured}, {}
     for name, (car, values) in cars.items():
         errors[name], responses[name], traces[name] = evaluate_car(suites, batch, car, values, settings)
     return {
@@ -183,13 +187,6 @@ def _make_stage(
     return Stage(name, tuple(families), tuned, entry["window"], population, generations), rows
 
 
-def _check_tuned(settings: Mapping[str, Any], valid: Sequence[str]) -> None:
-    """Checks that each tuned parameter is one of a structure."""
-    for name, entry in settings["stages"].items():
-        if unknown := [parameter for parameter in entry["tuned"] if parameter not in valid]:
-            raise ConfigError(f"sysid.stages.{name}.tuned: {unknown[0]!r}; valid: {', '.join(dict.fromkeys(valid))}")
-
-
 def refine(
     config: Mapping[str, Any], folder: Path, space: Space, simulator: Simulator, batch: ManoeuvreBatch, manoeuvres: Sequence[int],
     start: np.ndarray,
@@ -230,11 +227,6 @@ def _read(path: Path, digest: str, kind: type) -> Any:
     if content.pop("made") != digest:
         return None
     return kind(**{name: np.array(value) if isinstance(value, list) else value for name, value in content.items()})
-
-
-def measure_teacher(suites: Suites) -> dict[str, Any]:
-    """Measures the responses of the teacher by suite."""
-    return {suite: response_metrics.measure_recordings(recordings)._asdict() for suite, recordings in suites.items()}
 
 
 def evaluate_car(

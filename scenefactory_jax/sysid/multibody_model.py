@@ -113,11 +113,7 @@ class Vehicle:
 
 
 def _commonroad() -> tuple[Callable[..., Any], Any]:
-    """Imports the model and the BMW 320i.
-
-    Raises:
-        ConfigError: the package is missing.
-    """
+    """Imports the model and the BMW 320i; ConfigError: the package is missing."""
     try:
         from vehiclemodels.parameters_vehicle2 import parameters_vehicle2
         from vehiclemodels.vehicle_dynamics_mb import vehicle_dynamics_mb

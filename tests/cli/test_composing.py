@@ -15,19 +15,24 @@ CASES = [
 
 
 @pytest.mark.parametrize("words", CASES, ids=lambda words: " ".join(words[:2]))
-def test_a_shared_composition_is_hydras(words, monkeypatch):
+def test_a_shared_composition_is_hydras(words, monkeypatch, tmp_path):
     name, *overrides = words
-    for _ in range(2):  # composed, and handed out again
+    monkeypatch.setattr(composing, "FOLDER", tmp_path)
+    for _ in range(2):  # composed, and read from its file
+        monkeypatch.setattr(composing, "GROUPS", {})
         shared = composing.compose_once(name, overrides)
+    assert len(list(tmp_path.iterdir())) == 1
     monkeypatch.setattr(composing.ConfigRepository, "load_config", composing.load_config)
     monkeypatch.setattr(composing.defaults_list, "_create_interpolation_map", composing.map_choices)
+    monkeypatch.setattr(composing.Box, "_re_parent", composing.set_parents)
     expected = composing.compose(name, overrides)
     shared, expected = hydra_config.to_dict(shared), hydra_config.to_dict(expected)
     assert shared == expected and repr(shared) == repr(expected)  # in the same order
 
 
-def test_compositions_read_a_file_once(monkeypatch):
+def test_compositions_read_a_file_once(monkeypatch, tmp_path):
     files, load_config = [], composing.load_config
+    monkeypatch.setattr(composing, "FOLDER", tmp_path)
     monkeypatch.setattr(composing, "FILES", {})
     monkeypatch.setattr(composing, "GROUPS", {})
     monkeypatch.setattr(composing, "load_config", lambda self, config_path: files.append(config_path) or load_config(self, config_path))

@@ -13,6 +13,7 @@ from support.golden_planning import EDGES, KINDS, NAMES, OBJECTS, POINTS, make_e
 from support.golden_scenes import list_lines, load_golden, load_scene, needs_golden, pad, read_tracks
 
 from scenefactory_jax.core import savitzky_golay
+from scenefactory_jax.core.boxes import find_overlaps
 from scenefactory_jax.core.geometry import safe_norm
 from scenefactory_jax.evaluation.metrics import episode_metrics, episode_steps, vmax_steps, waymax_steps
 from scenefactory_jax.evaluation.metrics.episode_metrics import Value
@@ -191,7 +192,7 @@ def judge_objects(objects, size, valid, before, valid_before, edges):
 
     def of_object(row):
         car = position[row, :2], yaw[row], size[row]
-        overlap = waymax_steps.find_overlap(*car, position[:, :2], yaw, size, valid & (rows != row))
+        overlap = jnp.any(valid & (rows != row) & find_overlaps(*car, position[:, :2], yaw, size))
         corners = waymax_steps.compute_edge_distances(position[row], yaw[row], size[row], edges)
         motion = waymax_steps.find_infeasible_motion(before[row, 3], before[row, 4:6], yaw[row], velocity[row], dt=0.1)
         flags = {"overlap": overlap, "offroad": jnp.any(corners > 0), "kinematic_infeasibility": motion & valid_before[row]}

@@ -89,7 +89,7 @@ def measure(egos, size, others, edges, paths, lights):
         acceleration, curvature = bicycle_waymax.compute_inverse_action(before[3], before[4:6], yaw, velocity, dt=0.1)
         lane, lane_before = (waymax_steps.find_front_lane(row[:2], row[3], size, paths) for row in (now, before))
         return {
-            "overlap": waymax_steps.find_overlap(position, yaw, size, objects[:, :2], objects[:, 3], other_size, present),
+            "overlap": jnp.any(present & find_overlaps(position, yaw, size, objects[:, :2], objects[:, 3], other_size)),
             "edge_signed_distance": waymax_steps.compute_edge_distances(now[:3], yaw, size, edges),
             "sdc_progression": waymax_steps.compute_progression(position, log_first, log_last, paths),
             "sdc_off_route": waymax_steps.compute_off_route(position, paths, limits=waymax_steps.WAYMAX_OFF_ROUTE),

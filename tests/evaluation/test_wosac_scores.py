@@ -45,12 +45,11 @@ def make_scene(variant):
 
 @functools.cache
 def scores():
-    """Scores of all variants, by name, and their means."""
+    """Scores of all variants, by name."""
     score = jax.vmap(functools.partial(wosac_scores.score_rollouts, challenge=wosac_scores.CHALLENGES[2025]))
     scenes = jax.device_put(jax.tree.map(lambda *rows: np.stack(rows), *map(make_scene, VARIANTS)))
-    found, means = jax.jit(lambda scenes: (each := score(*scenes), wosac_scores.average_scenes(each)))(scenes)
-    found = jax.tree.map(np.asarray, found)
-    return {name: jax.tree.map(lambda values, row=row: values[row], found) for row, name in enumerate(VARIANTS)}, means
+    found = jax.tree.map(np.asarray, jax.jit(lambda scenes: score(*scenes))(scenes))
+    return {name: jax.tree.map(lambda values, row=row: values[row], found) for row, name in enumerate(VARIANTS)}
 
 
 def list_invalid(found):
@@ -73,11 +72,11 @@ EDGES, LIGHTS_ONLY = {"distance_to_road_edge", "offroad", "map", "meta"}, {"ligh
     ],
 )
 def test_scores_that_a_scene_lacks_are_marked(variant, invalid):
-    assert list_invalid(scores()[0][variant]) == invalid
+    assert list_invalid(scores()[variant]) == invalid
 
 
 def test_scores_of_the_street():
-    found = scores()[0]["all"]
+    found = scores()["all"]
     stands = 1 / ROLLOUTS
     assert found.rates["light_violation"].value == 1 - stands
     assert found.rates["collision"].value == found.rates["offroad"].value == 0
@@ -90,18 +89,16 @@ def test_scores_of_the_street():
 
 
 def test_a_scene_without_lights_counts_as_without_violations():
-    lit, dark = scores()[0]["all"], scores()[0]["no lights"]
+    lit, dark = scores()["all"], scores()["no lights"]
     np.testing.assert_allclose(dark.likelihoods["light_violation"].value, 1.0, atol=1e-3)
     gained = dark.likelihoods["light_violation"].value - lit.likelihoods["light_violation"].value
     np.testing.assert_allclose(dark.meta.value - lit.meta.value, 0.05 * gained, rtol=1e-4)
 
 
-def test_means_leave_out_scenes_that_lack_a_score():
-    each, means = scores()
-    used = [each[name].meta.value for name in VARIANTS if each[name].meta.valid]
-    assert len(used) == 2
-    np.testing.assert_allclose(means.meta.value, np.mean(used), rtol=1e-6)
-    assert means.likelihoods["light_violation"].valid
+def test_means_leave_out_what_is_not_counted():
+    mean = wosac_scores.average(jnp.array([1.0, jnp.nan, 2.0]), jnp.array([True, False, True]))
+    assert mean.value == 1.5 and mean.valid
+    assert not wosac_scores.average(jnp.ones(2), jnp.zeros(2, bool)).valid
 
 
 @pytest.mark.parametrize(("year", "total"), [(2023, 0.99), (2024, 1.0), (2025, 1.0)])

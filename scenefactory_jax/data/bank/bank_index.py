@@ -84,11 +84,7 @@ def read(path: Path) -> Index:
 
 
 def _entries(path: Path) -> dict[str, Any] | None:
-    """Entries of a folder's index, of any format; None without an index.
-
-    Raises:
-        SceneError: it cannot be read, or is damaged.
-    """
+    """Entries of a folder's index, of any format; None without an index; SceneError: it cannot be read, or is damaged."""
     file = path / INDEX
     try:
         content = file.read_bytes()

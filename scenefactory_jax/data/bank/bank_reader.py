@@ -110,7 +110,8 @@ def read_raws(bank: Bank, indices: Sequence[int] | np.ndarray) -> Iterator[RawSc
     Raises:
         SceneError: no such scene, or a shard that is missing or damaged.
     """
-    yield from _scenes(bank.shards, bank.places[_rows(bank, indices)], bank.readers)
+    for number, *place in bank.places[_rows(bank, indices)].tolist():
+        yield _reader(bank.shards, number, bank.readers).scene(place)  # a shard is mapped when its first scene is read
 
 
 def view(bank: Bank, indices: Sequence[int] | np.ndarray) -> Bank:
@@ -194,11 +195,6 @@ def write(
         )
         bank_writer.fill(folder, shards, settings=settings, compression=compression)
     return open(path)
-
-
-def _scenes(shards: Sequence[Shard], places: Int[np.ndarray, "N 5"], readers: Readers) -> Iterator[RawScene]:
-    """Scenes one after another; a shard is mapped when its first scene is read."""
-    return (_reader(shards, number, readers).scene(place) for number, *place in places.tolist())
 
 
 def _batches(shards: Sequence[Shard], places: Int[np.ndarray, "N 5"], readers: Readers) -> Iterator[pa.RecordBatch]:

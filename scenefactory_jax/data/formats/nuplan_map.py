@@ -7,7 +7,7 @@ to right. The colours of painted lines are unknown: all are white.
 
 import re
 from collections import defaultdict
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -113,11 +113,6 @@ def _to_id(value: Any) -> int | None:
         return None
 
 
-def _list_ids(texts: Iterable[Any]) -> list[int]:
-    """The integers in texts such as `12,13`."""
-    return [int(part) for text in texts if text is not None for part in re.findall(r"\d{1,18}", str(text))]
-
-
 def _make_lanes(
     paths: Layer, polygons: Layer, connectors: Layer, spacing_m: float, where: str
 ) -> tuple[list[Polyline], dict[tuple[str, int], int]]:
@@ -156,6 +151,7 @@ def _list_signs(shape: Any, row: tuple[Any, ...], ids: dict[tuple[str, int], int
     if row[0] != STOP_SIGN_POLYGON:
         return []
     for layer, value in zip((CONNECTORS, LANES), row[1:], strict=True):
-        if lanes := [ids[layer, fid] for fid in _list_ids([value]) if (layer, fid) in ids]:
+        fids = map(int, re.findall(r"\d{1,18}", str(value)))  # of a text such as `12,13`, or of none
+        if lanes := [ids[layer, fid] for fid in fids if (layer, fid) in ids]:
             return [Sign(shapely.get_coordinates(shape.centroid), tuple(lanes))]
     return []

@@ -135,10 +135,6 @@ def _polynomial(u: Sequence[float], v: Sequence[float], end: float, length: floa
     return evaluate
 
 
-def _read_spiral(shape: Element, length: float) -> Callable[[Column], Frames]:
-    return _curve(shape.number("curvStart"), shape.number("curvEnd"), length, shape.where)
-
-
 def _read_poly3(shape: Element, length: float) -> Callable[[Column], Frames]:
     """v(u) as a curve with p = u; its arc length at p is not below p, so that the end lies within `length`."""
     v = [shape.number(name) for name in COEFFICIENTS]
@@ -158,7 +154,7 @@ def _read_param_poly3(shape: Element, length: float) -> Callable[[Column], Frame
 SHAPES: dict[str, Callable[[Element, float], Callable[[Column], Frames]]] = {
     "line": lambda shape, length: _curve(0.0, 0.0, length, shape.where),
     "arc": lambda shape, length: _curve(shape.number("curvature"), shape.number("curvature"), length, shape.where),
-    "spiral": _read_spiral,
+    "spiral": lambda shape, length: _curve(shape.number("curvStart"), shape.number("curvEnd"), length, shape.where),
     "poly3": _read_poly3,
     "paramPoly3": _read_param_poly3,
 }

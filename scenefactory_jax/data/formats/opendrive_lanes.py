@@ -221,8 +221,8 @@ class Road:
             number = record.integer("id")
             if number == 0:
                 continue
-            if _is_paved(record, *borders[number]):
-                inner, outer = borders[number]
+            (inner, outer), kind = borders[number], record.get("type", "none")
+            if kind in PAVED or (kind in STRIPS and np.abs(outer - inner).max() <= MAX_STRIP_M):
                 runs[-1].append((outer, inner) if number > 0 else (inner, outer))  # the left border first
             elif np.ptp(borders[number], axis=0).max() > 1e-3:  # a lane without width divides nothing
                 runs.append([])
@@ -231,12 +231,6 @@ class Road:
             if run and (run[0][0] - run[-1][1]).max() > 1e-3:
                 outlines.append(np.concatenate([self.place(s, run[0][0]), self.place(s, run[-1][1])[::-1]]))
         return outlines
-
-
-def _is_paved(lane: Element, inner: Column, outer: Column) -> bool:
-    """Whether a lane is part of the area within the road edges."""
-    kind = lane.get("type", "none")
-    return kind in PAVED or (kind in STRIPS and bool(np.abs(outer - inner).max() <= MAX_STRIP_M))
 
 
 def _find_wide(lane: Element, inner: Column, outer: Column) -> slice | None:

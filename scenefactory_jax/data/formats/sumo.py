@@ -102,7 +102,8 @@ def read(
         if OTHER_FILES.search(_read_start(path)) and any(_is_net(file) for file in _list_beside(path)):
             raise Companion(f"{path}: a file of a simulation of SUMO, whose network lies beside it") from None
         raise
-    if any(_is_recording(file) and _find_net(file) == Path(path) for file in _list_beside(path)):
+    recordings = (one for one in _list_beside(path) if _has_root(one, RECORDING) or _read_start(one).startswith(TABLE.decode()))
+    if any(_find_net(file) == Path(path) for file in recordings):
         raise Companion(f"{path}: the network of recordings of SUMO beside it")
     lights = [Light(s.lane, np.zeros(1, int), np.zeros(1, bool), s.stop, s.plan) for s in net.signals if s.plan is not None]
     dark = [[[s.lane]] for s in net.signals if s.plan is None]
@@ -144,10 +145,6 @@ def _has_root(path: Path, root: str) -> bool:
 
 def _is_net(path: Path) -> bool:
     return ".net.xml" in path.name or _has_root(path, sumo_net.ROOT)
-
-
-def _is_recording(path: Path) -> bool:
-    return _has_root(path, RECORDING) or _read_start(path).startswith(TABLE.decode())
 
 
 def _find_net(path: Path) -> Path | None:

@@ -9,7 +9,7 @@ from scenefactory_jax.core.geometry import dot, to_frame
 from scenefactory_jax.core.schema import Count, Positive
 from scenefactory_jax.core.types import Scene, SetObservation, State
 from scenefactory_jax.env import route_following
-from scenefactory_jax.env.observations.column_bounds import FRACTION, SIGNED, bound_observation, compress_length
+from scenefactory_jax.env.observations.column_bounds import FRACTION, SIGNED, bound_observation, compress_length, pad_rows
 from scenefactory_jax.roadgraph import traffic_lights
 
 
@@ -25,7 +25,7 @@ def lights(scene: Scene, state: State, *, count: Count, distance_scale_m: Positi
     rows = _choose_next(scene, state, lines, ~lines.stop_sign, count)
     shown = jnp.take_along_axis(lines.state, rows.slot, axis=1)
     columns = [*_place(scene, state, rows, distance_scale_m), traffic_lights.encode_colour(shown)]
-    return _pad(jnp.concatenate(columns, axis=-1), rows.mask, count)
+    return pad_rows(jnp.concatenate(columns, axis=-1), rows.mask, count)
 
 
 @bound_observation(FRACTION, SIGNED, SIGNED, FRACTION)
@@ -39,7 +39,7 @@ def signs(scene: Scene, state: State, *, count: Count, distance_scale_m: Positiv
     rows = _choose_next(scene, state, lines, lines.stop_sign, count)
     stood = state.route.stood[:, None] & (jnp.arange(rows.mask.shape[1]) == 0)
     columns = [*_place(scene, state, rows, distance_scale_m), stood[..., None].astype(jnp.float32)]
-    return _pad(jnp.concatenate(columns, axis=-1), rows.mask, count)
+    return pad_rows(jnp.concatenate(columns, axis=-1), rows.mask, count)
 
 
 @bound_observation(SIGNED, SIGNED, SIGNED, SIGNED, FRACTION)
@@ -54,7 +54,7 @@ def nearest_controls(
     controls, yaw = scene.controls, state.motion.yaw[:, None]
     total = controls.valid.shape[0]
     if total == 0:
-        return _pad(jnp.zeros((len(state.active), 0, 10), jnp.float32), jnp.zeros((len(state.active), 0), bool), count)
+        return pad_rows(jnp.zeros((len(state.active), 0, 10), jnp.float32), jnp.zeros((len(state.active), 0), bool), count)
     apart = controls.position[None] - state.motion.position[:, None, :2]
     squared = jnp.where(controls.valid & (dot(apart, apart) <= radius_m**2), dot(apart, apart), jnp.inf)
     order = jnp.argsort(squared, axis=1)[:, : min(count, total)]
@@ -65,7 +65,7 @@ def nearest_controls(
     colour = jnp.where(sign[..., None], 0.0, traffic_lights.encode_colour(shown))
     own = _is_ahead(scene, state, order)
     flags = jnp.stack([sign, own], axis=-1).astype(jnp.float32)
-    return _pad(jnp.concatenate([place, to_frame(controls.direction[order], yaw), colour, flags], axis=-1), mask, count)
+    return pad_rows(jnp.concatenate([place, to_frame(controls.direction[order], yaw), colour, flags], axis=-1), mask, count)
 
 
 class _Rows(NamedTuple):
@@ -99,10 +99,3 @@ def _is_ahead(scene: Scene, state: State, control: Int[Array, "A N"]) -> Bool[Ar
     lines = route_following.find_stop_lines(scene, state.agents, state.route.arc, jnp.float32(0.0))
     ahead = (lines.distance > 0) & jnp.isfinite(lines.distance) & route_following.find_routed(scene, state.agents)[:, None]
     return jnp.any(ahead[:, None] & (lines.control[:, None] == control[..., None]), axis=-1)
-
-
-def _pad(features: Float[Array, "A N F"], mask: Bool[Array, "A N"], count: int) -> SetObservation:
-    """Pads to `count` rows, with zeros where the mask is false."""
-    padding = count - mask.shape[1]
-    features = jnp.where(mask[..., None], features, 0.0)
-    return SetObservation(jnp.pad(features, ((0, 0), (0, padding), (0, 0))), jnp.pad(mask, ((0, 0), (0, padding))))

@@ -7,7 +7,8 @@ from jaxtyping import Array, Float
 from scenefactory_jax.core.geometry import safe_norm
 from scenefactory_jax.core.schema import Count, NonNegative, Positive
 from scenefactory_jax.core.types import Boxes, Scene, State
-from scenefactory_jax.env import route_following, spawning
+from scenefactory_jax.dynamics.collision import collect_boxes
+from scenefactory_jax.env import route_following
 from scenefactory_jax.env.observations.column_bounds import ANY, FRACTION, LENGTH, SIGNED, bound_observation, compress_length
 from scenefactory_jax.env.traffic import corridor
 
@@ -40,7 +41,7 @@ def leader(
     free = jnp.zeros((len(state.active), COLUMNS), jnp.float32).at[:, 1].set(1.0)
     if scene.routes.length.shape[0] == 0 or scene.routes.position.shape[1] < 2:
         return free
-    cars = spawning.make_boxes(motion, agents, state.active)
+    cars = collect_boxes(motion, agents.size, state.active, jnp.inf)
     boxes: Boxes = jax.tree.map(lambda *leaves: jnp.concatenate(leaves), cars, scene.traffic)
     points = max(int(look_ahead_m // chord_m), 1) + 1
     arc = state.route.arc

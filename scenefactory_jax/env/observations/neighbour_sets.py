@@ -2,13 +2,13 @@
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Int
 
 from scenefactory_jax.core.geometry import SMALLEST, cover_with_circles, dot, safe_norm, to_frame, wrap_angle
 from scenefactory_jax.core.schema import Count, Positive
 from scenefactory_jax.core.types import Motion, Scene, SetObservation, State
 from scenefactory_jax.env import surrogate_safety
-from scenefactory_jax.env.observations.column_bounds import ANY, FRACTION, LENGTH, SIGNED, bound_observation, compress_length
+from scenefactory_jax.env.observations.column_bounds import ANY, FRACTION, LENGTH, SIGNED, bound_observation, compress_length, pad_rows
 
 
 @bound_observation(ANY, ANY, LENGTH, LENGTH, SIGNED, LENGTH, FRACTION)
@@ -29,7 +29,7 @@ def neighbours(
     yaw = wrap_angle(users.yaw[order] - motion.yaw[:, None]) / jnp.pi
     speed = safe_norm(users.velocity)[order] / speed_scale_mps
     columns = [position, users.size[order] / distance_scale_m, yaw[..., None], speed[..., None], time[..., None]]
-    return _pad(jnp.concatenate(columns, axis=-1), mask, count)
+    return pad_rows(jnp.concatenate(columns, axis=-1), mask, count)
 
 
 @bound_observation(SIGNED, SIGNED, ANY, ANY, SIGNED, SIGNED, ANY, LENGTH, LENGTH, SIGNED, FRACTION, FRACTION, FRACTION)
@@ -69,7 +69,7 @@ def closest_approach(
         compress_length(closest, gap_scale_m)[..., None],
         (time_scale_s / (time_scale_s + pairs.ttc))[..., None],  # 0 if they never meet, 1 once they touch
     ]
-    return _pad(jnp.concatenate(columns, axis=-1), mask, count)
+    return pad_rows(jnp.concatenate(columns, axis=-1), mask, count)
 
 
 def _find_nearest(
@@ -92,10 +92,3 @@ def _find_nearest(
     pairs = surrogate_safety.separate_levels(pairs, scene, motion)
     mask, pairs = jax.tree.map(lambda leaf: jnp.take_along_axis(leaf, order, axis=1), (others, pairs))
     return motion, users, order, mask, pairs
-
-
-def _pad(features: Float[Array, "A N F"], mask: Bool[Array, "A N"], count: int) -> SetObservation:
-    """Pads to `count` rows, with zeros where the mask is false."""
-    padding = count - mask.shape[1]
-    features = jnp.where(mask[..., None], features, 0.0)
-    return SetObservation(jnp.pad(features, ((0, 0), (0, padding), (0, 0))), jnp.pad(mask, ((0, 0), (0, padding))))

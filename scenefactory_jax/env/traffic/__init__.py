@@ -32,7 +32,8 @@ def make(entry: Mapping[str, Any], *, where: str = "traffic", **context: Any) ->
     if entry.get("_target_") != MIXED:
         return instantiate(entry, builtins=__name__, where=where, **context)()
     check_names(entry, ["_target_", "parts"], where=where, required=["parts"])
-    parts = {name: part for name, part in (entry["parts"] or {}).items() if not _is_left_out(part)}
+    left_out = lambda part: part is None or (isinstance(part, Mapping) and part.get("weight", 0) is None)  # noqa: E731
+    parts = {name: part for name, part in (entry["parts"] or {}).items() if not left_out(part)}
     if not parts:
         raise ConfigError(f"{where}.parts: expected entries of the group `traffic` by name, got {entry['parts']!r}")
     kinds, weights = [], []
@@ -43,7 +44,3 @@ def make(entry: Mapping[str, Any], *, where: str = "traffic", **context: Any) ->
         weights.append(float(read_value(part["weight"], Annotated[float, Bounds(above=0)], where=f"{place}.weight")))
         kinds.append(make({key: value for key, value in part.items() if key != "weight"}, where=place, **context))
     return mix_traffic(kinds, weights)
-
-
-def _is_left_out(part: Any) -> bool:
-    return part is None or (isinstance(part, Mapping) and "weight" in part and part["weight"] is None)

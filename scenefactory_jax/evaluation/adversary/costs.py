@@ -123,16 +123,6 @@ def compute_off_road(
     return jnp.sum(take_largest(jnp.swapaxes(excess, 1, 2) ** 2))
 
 
-def compute_change(change: Float[Array, "K T 2"]) -> Float[Array, ""]:
-    """Computes the sum over cars and actions of the mean square of the changes from the log."""
-    return jnp.sum(jnp.mean(change**2, axis=1))
-
-
-def compute_roughness(change: Float[Array, "K T 2"]) -> Float[Array, ""]:
-    """Computes the sum over cars and actions of the mean square of the steps between changes one after the other."""
-    return jnp.sum(jnp.mean(jnp.diff(change, axis=1) ** 2, axis=1))
-
-
 def find_bearing(position: Float[Array, "*n 2"], yaw: Float[Array, "*n"], other: Float[Array, "*m 2"]) -> Float[Array, "*k"]:
     """Finds the bearing of another car from a heading, rad."""
     local = to_frame(other - position, yaw)

@@ -92,7 +92,8 @@ def find_first_contact(scene: Scene, drive: Drive) -> Contact:
     at = lambda tree: jax.tree.map(lambda leaf: leaf[step], tree)  # noqa: E731
     now, own, boxes = at(contacts), at(ego), at(traffic)
     row = jnp.argmax(counted[step])
-    lanes = scoring.list_lane_points(scene, _make_lane_facts(scene))
+    zero = jnp.zeros_like(scene.lanes.half_length)
+    lanes = scoring.list_lane_points(scene, scoring.LaneFacts(zero, zero > 0, zero > 0))  # facts that places on lanes do not read
     several = vmax_steps.locate_on_lanes(own.position, own.yaw, size, lanes).several_lanes
     speed, speeds = safe_norm(own.velocity), safe_norm(boxes.velocity)
     ego_fault = vmax_steps.find_at_fault(now, speed, speeds, scene.traffic_log.kind, several)[row]
@@ -102,12 +103,6 @@ def find_first_contact(scene: Scene, drive: Drive) -> Contact:
     other_fault = vmax_steps.find_at_fault(seen, speeds[row], speed[None], jnp.zeros(1, jnp.int32), several)[0]
     closing = safe_norm(own.velocity - boxes.velocity[row])
     return Contact(jnp.any(counted), step, row, ego_fault, other_fault, closing, jnp.any(touching, axis=0))
-
-
-def _make_lane_facts(scene: Scene) -> scoring.LaneFacts:
-    """Facts that places on lanes do not read."""
-    zero = jnp.zeros_like(scene.lanes.half_length)
-    return scoring.LaneFacts(zero, zero.astype(bool), zero.astype(bool))
 
 
 def find_off_road(scene: Scene, position: Float[Array, "T 2"], yaw: Float[Array, " T"], size: Float[Array, "2"]) -> Bool[Array, " T"]:

@@ -211,7 +211,8 @@ def compute_upkeep(change: Float[Array, "K M 2"], track: Track, problem: Problem
     outside = costs.compute_outside(*places, problem.road, half_lane_m=weights.half_lane_m)
     off_road = costs.compute_off_road(outside, problem.allowed, there[:, some], margin_m=weights.off_road_margin_m)
     kept = weights.repulsion * repulsion + weights.off_road * off_road
-    return kept + weights.change * costs.compute_change(change) + weights.smoothness * costs.compute_roughness(change)
+    change, roughness = (jnp.sum(jnp.mean(part**2, axis=1)) for part in (change, jnp.diff(change, axis=1)))  # over cars and actions
+    return kept + weights.change * change + weights.smoothness * roughness
 
 
 def judge(scene: Scene, driven: Drive, track: Track, problem: Problem, settings: AttackSettings) -> Outcome:

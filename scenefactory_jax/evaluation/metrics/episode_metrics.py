@@ -56,7 +56,9 @@ def collect_metrics(
     as_published: bool | Bool[Array, ""] = False,
 ) -> dict[str, Value]:
     """Collects the metrics of an episode from those of its steps; see `compute_episode_metrics`."""
-    found = _collect_events(record, steps, as_published=as_published) | _collect_routes(record, steps) | _collect_comfort(record, dt=dt)
+    beyond, used = find_uncomfortable(record, dt=dt)
+    found = _collect_events(record, steps, as_published=as_published) | _collect_routes(record, steps)
+    found |= {"comfort": (~jnp.any(beyond), jnp.any(used))}
     found |= _collect_lanes(record, steps, dt=dt, as_published=as_published) | _collect_nuplan(record, steps, dt=dt)
     found |= _collect_safety(record, steps) | _collect_scenarionet(record, steps, max_lateral_m=max_lateral_m)
     any_counted = jnp.any(record.counted)
@@ -134,11 +136,6 @@ def find_uncomfortable(record: EpisodeRecord, *, dt: float) -> tuple[Bool[Array,
     used = record.counted[end] & jnp.all(record.ego.valid[window], axis=1)
     spread = lambda mask: jnp.zeros_like(record.counted).at[end].set(mask)  # noqa: E731
     return spread(~comfortable & used), spread(used)
-
-
-def _collect_comfort(record: EpisodeRecord, *, dt: float) -> Pairs:
-    beyond, used = find_uncomfortable(record, dt=dt)
-    return {"comfort": (~jnp.any(beyond), jnp.any(used))}
 
 
 def compute_overspeed(record: EpisodeRecord, steps: StepMetrics) -> Float[Array, " T"]:

@@ -58,7 +58,8 @@ def measure_steps(
         surrogates: the circles that stand for road users, and the gap of DRAC; None: no measures between circles.
     """
     ego, others = record.ego, record.others
-    touching = find_overlaps(ego.position[:, None, :2], ego.yaw[:, None], record.size, *_at_all_steps(record), others.size)
+    boxes = others.position.swapaxes(0, 1), others.yaw.T, others.size
+    touching = find_overlaps(ego.position[:, None, :2], ego.yaw[:, None], record.size, *boxes)
     first, last = find_span(record)
     counted = find_inside(first, last, len(ego.yaw)) & ego.valid
     touching = touching & others.valid.T & ego.valid[:, None]
@@ -73,10 +74,6 @@ def measure_steps(
         return found | _judge_contacts(record, step, contacts, found, collided[step], fresh[step])
 
     return StepMetrics(touching=touching, **jax.lax.map(at_step, jnp.arange(len(ego.yaw))))
-
-
-def _at_all_steps(record: EpisodeRecord) -> tuple[Float[Array, "T O 2"], Float[Array, "T O"]]:
-    return record.others.position.swapaxes(0, 1), record.others.yaw.T
 
 
 def find_contacts(record: EpisodeRecord, step: Int[Array, ""], *, as_published: bool | Bool[Array, ""] = False) -> vmax_steps.Contacts:

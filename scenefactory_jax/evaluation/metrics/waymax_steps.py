@@ -9,7 +9,7 @@ from typing import NamedTuple
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from scenefactory_jax.core.boxes import compute_corners, find_overlaps
+from scenefactory_jax.core.boxes import compute_corners
 from scenefactory_jax.core.geometry import heading_vector, safe_norm
 from scenefactory_jax.core.types import RED_STATES
 from scenefactory_jax.dynamics.bicycle_waymax import compute_inverse_action
@@ -32,19 +32,6 @@ class Paths(NamedTuple):
     arc: Float[Array, "R N"]  # arc length, m
     lane: Int[Array, "R N"]
     on_route: Bool[Array, " R"]
-
-
-def find_overlap(
-    position: Float[Array, "2"],
-    yaw: Float[Array, ""],
-    size: Float[Array, "2"],
-    other_position: Float[Array, "O 2"],
-    other_yaw: Float[Array, " O"],
-    other_size: Float[Array, "O 2"],
-    valid: Bool[Array, " O"],
-) -> Bool[Array, ""]:
-    """Finds whether the car's rectangle overlaps that of any valid object."""
-    return jnp.any(valid & find_overlaps(position, yaw, size, other_position, other_yaw, other_size))
 
 
 def compute_edge_distances(

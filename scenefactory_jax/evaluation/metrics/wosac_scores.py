@@ -254,9 +254,3 @@ def score_rollouts(
     counted = find_counted(log, evaluated, kept, vehicle, road)
     positions = log.state[evaluated, HISTORY_STEPS:, :3], rollouts[:, evaluated, :, :3]
     return compute_scene_scores(features, simulated, *positions, counted, challenge=challenge)
-
-
-def average_scenes(scores: SceneScores) -> SceneScores:
-    """Computes the means over scenes (the leading axis); each score over the scenes that determine it."""
-    is_score = lambda node: isinstance(node, Score)  # noqa: E731
-    return jax.tree.map(lambda score: average(score.value, score.valid), scores, is_leaf=is_score)

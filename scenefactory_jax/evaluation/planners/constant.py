@@ -6,7 +6,7 @@ import jax.numpy as jnp
 
 from scenefactory_jax.core.types import Policy
 from scenefactory_jax.evaluation.planners import tracker
-from scenefactory_jax.evaluation.planners.route_tracking import require_groups
+from scenefactory_jax.evaluation.planners.route_tracking import make_planner
 from scenefactory_jax.evaluation.planners.tracker import Tracker, select_tracker
 
 
@@ -24,13 +24,9 @@ def make(*, trackers: dict[str, Tracker], dynamics: dict[str, Any] | None = None
     """
     car = select_tracker(trackers, dynamics)
 
-    def init(key, observation):
-        return {}
-
-    def apply(parameters, observation):
-        require_groups(observation, "planning", planner="constant", option="planning")
+    def act(observation):
         speed = observation["planning"].velocity[..., 0]
         zero = jnp.zeros_like(speed)
-        return tracker.make_action(zero, zero, speed, car), jnp.full(3, -jnp.inf), zero
+        return tracker.make_action(zero, zero, speed, car)
 
-    return Policy(init, apply)
+    return make_planner(act, "planning", planner="constant", option="planning")

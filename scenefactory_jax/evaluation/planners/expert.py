@@ -11,7 +11,7 @@ from scenefactory_jax.core.types import Policy
 from scenefactory_jax.dynamics.bicycle_waymax import STANDING_MPS, compute_inverse_action
 from scenefactory_jax.env.observations.log_view import LogView
 from scenefactory_jax.evaluation.planners import tracker
-from scenefactory_jax.evaluation.planners.route_tracking import require_groups
+from scenefactory_jax.evaluation.planners.route_tracking import make_planner
 from scenefactory_jax.evaluation.planners.tracker import Tracker, select_tracker
 
 
@@ -44,11 +44,7 @@ def make(
     """
     car, action_s = select_tracker(trackers, dynamics), observations["log"]["action_s"]
 
-    def init(key, observation):
-        return {}
-
-    def apply(parameters, observation):
-        require_groups(observation, "log", planner="expert", option="log")
+    def act(observation):
         view: LogView = observation["log"]
         speed = view.velocity[..., 0]
         if feedback:
@@ -57,10 +53,9 @@ def make(
             heading = jnp.zeros_like(speed)
             acceleration, curvature = compute_inverse_action(heading, view.velocity, view.next.yaw, view.next.velocity, dt=action_s)
         action = tracker.make_action(acceleration, curvature, speed, car, grade=view.grade)
-        action = jnp.where(view.valid[..., None], action, tracker.make_braking_action(speed, car))
-        return action, jnp.full(3, -jnp.inf), jnp.zeros_like(speed)
+        return jnp.where(view.valid[..., None], action, tracker.make_braking_action(speed, car))
 
-    return Policy(init, apply)
+    return make_planner(act, "log", planner="expert", option="log")
 
 
 def follow_log(

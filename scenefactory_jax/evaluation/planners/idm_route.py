@@ -50,14 +50,9 @@ def make(
 
     tracker = select_tracker(trackers, dynamics)
 
-    def init(key, observation):
-        return {}
-
-    def apply(parameters, observation):
-        route_tracking.require_groups(observation, "ego", "route", "leader", "lights", "signs", planner="idm_route")
+    def act(observation):
         limit_mps2, model, hardest = None, law, max_braking_mps2
         if friction_part is not None:
-            route_tracking.require_groups(observation, "friction_ahead", planner="idm_route")
             limit_mps2 = friction_part * GRAVITY * jnp.min(observation["friction_ahead"], axis=-1)
             model, hardest = idm_law.limit_law(law, limit_mps2), jnp.minimum(max_braking_mps2, limit_mps2)
         route = route_tracking.read_route(observation["route"], observations["route"])
@@ -70,10 +65,10 @@ def make(
         demand = jnp.maximum(demand, idm_law.compute_interaction(speed, line, jnp.zeros_like(line), model))
         acceleration = jnp.maximum(idm_law.compute_acceleration(speed, target, demand, model), -max_braking_mps2)
         grade = route_tracking.read_grade(observation, observations)
-        action = route_tracking.make_action(acceleration, route, speed, tracker, grade=grade)
-        return action, jnp.full(3, -jnp.inf), jnp.zeros_like(speed)
+        return route_tracking.make_action(acceleration, route, speed, tracker, grade=grade)
 
-    return Policy(init, apply)
+    groups = ("ego", "route", "leader", "lights", "signs", *(["friction_ahead"] if friction_part is not None else []))
+    return route_tracking.make_planner(act, *groups, planner="idm_route")
 
 
 def read_leader(vector: Float[Array, "*n 4"], scales: Mapping[str, Any]) -> tuple[Float[Array, "*n"], Float[Array, "*n"]]:

@@ -17,7 +17,7 @@ from scenefactory_jax.evaluation.planners import pdm_proposals, pdm_scoring, pdm
 from scenefactory_jax.evaluation.planners.pdm_proposals import ProposalConfig
 from scenefactory_jax.evaluation.planners.pdm_scoring import ScoreConfig, Scores
 from scenefactory_jax.evaluation.planners.pdm_simulation import Simulated, SimulationConfig
-from scenefactory_jax.evaluation.planners.route_tracking import require_groups
+from scenefactory_jax.evaluation.planners.route_tracking import make_planner
 from scenefactory_jax.evaluation.planners.tracker import Tracker, select_tracker
 
 
@@ -59,9 +59,6 @@ def make(
     """
     car = select_tracker(trackers, dynamics)
 
-    def init(key, observation):
-        return {}
-
     def drive(view: PlanningView) -> tuple[Array, Array]:
         limit = None if friction_part is None else friction_part * GRAVITY * view.mu
         found, simulated = score_proposals(view, proposals, simulation, scores, car, limit_mps2=limit)
@@ -70,17 +67,15 @@ def make(
         acceleration = jnp.where(brakes, -emergency.braking_mps2, simulated.acceleration[best])
         return acceleration, jnp.where(brakes, 0.0, jnp.tan(simulated.steer[best]) / car.wheelbase_m)
 
-    def apply(parameters, observation):
-        require_groups(observation, "planning", planner="pdm_closed", option="planning")
+    def act(observation):
         view: PlanningView = observation["planning"]
         speed = view.velocity[..., 0]
         flat = jax.tree.map(lambda leaf: leaf.reshape(math.prod(speed.shape), *leaf.shape[speed.ndim :]), view)
         acceleration, curvature = (leaf.reshape(speed.shape) for leaf in jax.vmap(drive)(flat))
         action = tracker.make_action(acceleration, curvature, speed, car, grade=view.grade)
-        action = jnp.where(view.line.known[..., None], action, tracker.make_braking_action(speed, car))
-        return action, jnp.full(3, -jnp.inf), jnp.zeros_like(speed)
+        return jnp.where(view.line.known[..., None], action, tracker.make_braking_action(speed, car))
 
-    return Policy(init, apply)
+    return make_planner(act, "planning", planner="pdm_closed", option="planning")
 
 
 def score_proposals(

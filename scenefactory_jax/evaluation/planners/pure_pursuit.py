@@ -6,6 +6,7 @@ import jax.numpy as jnp
 
 from scenefactory_jax.core.schema import ConfigError, Positive
 from scenefactory_jax.core.types import Policy
+from scenefactory_jax.evaluation.planners.route_tracking import make_planner
 from scenefactory_jax.evaluation.planners.tracker import Tracker, compute_steer, select_tracker
 
 
@@ -37,10 +38,7 @@ def make(
 
     tracker = select_tracker(trackers, dynamics)
 
-    def init(key, observation):
-        return {}
-
-    def apply(parameters, observation):
+    def act(observation):
         if "ego" not in observation:
             has = ", ".join(sorted(observation)) or "none"
             raise ConfigError(f"policy: pure pursuit needs the observation group `ego`; the observation has: {has}")
@@ -48,7 +46,6 @@ def make(
         sine, cosine, distance_m = ego[..., 2], ego[..., 3], jnp.maximum(goal_scale_m * ego[..., 4], 1.0)
         steer = jnp.where(cosine > 0.0, compute_steer(2.0 * sine / distance_m, tracker), jnp.copysign(1.0, sine))
         throttle = (speed_mps - speed_scale_mps * ego[..., 5]) / speed_band_mps
-        mean = jnp.stack([throttle, steer, -jnp.ones_like(steer)], axis=-1)
-        return jnp.clip(mean, -1.0, 1.0), jnp.full(3, -jnp.inf), jnp.zeros_like(steer)
+        return jnp.clip(jnp.stack([throttle, steer, -jnp.ones_like(steer)], axis=-1), -1.0, 1.0)
 
-    return Policy(init, apply)
+    return make_planner(act, planner="pure_pursuit")

@@ -3,7 +3,7 @@
 import jax.numpy as jnp
 
 from scenefactory_jax.core.types import Policy
-from scenefactory_jax.evaluation.planners.route_tracking import require_groups
+from scenefactory_jax.evaluation.planners.route_tracking import make_planner
 
 
 def make() -> Policy:
@@ -15,13 +15,8 @@ def make() -> Policy:
         ConfigError: at `apply`, an observation without the group `noise`.
     """
 
-    def init(key, observation):
-        return {}
-
-    def apply(parameters, observation):
-        require_groups(observation, "noise", planner="random", option="noise")
+    def act(observation):
         throttle, steer = observation["noise"][..., 0], observation["noise"][..., 1]
-        action = jnp.stack([throttle, steer, jnp.where(throttle < 0, -throttle, -1.0)], axis=-1)
-        return action, jnp.full(3, -jnp.inf), jnp.zeros_like(throttle)
+        return jnp.stack([throttle, steer, jnp.where(throttle < 0, -throttle, -1.0)], axis=-1)
 
-    return Policy(init, apply)
+    return make_planner(act, "noise", planner="random", option="noise")

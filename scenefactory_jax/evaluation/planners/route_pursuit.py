@@ -35,16 +35,11 @@ def make(
 
     tracker = select_tracker(trackers, dynamics)
 
-    def init(key, observation):
-        return {}
-
-    def apply(parameters, observation):
-        route_tracking.require_groups(observation, "ego", "route", planner="route_pursuit")
+    def act(observation):
         route = route_tracking.read_route(observation["route"], observations["route"])
         speed = observations["ego"]["speed_scale_mps"] * observation["ego"][..., 5]
         target = route_tracking.compute_target_speed(route, jnp.full_like(route.limit, speed_mps), tracker)
         grade = route_tracking.read_grade(observation, observations)
-        action = route_tracking.make_action((target - speed) / response_s, route, speed, tracker, grade=grade)
-        return action, jnp.full(3, -jnp.inf), jnp.zeros_like(speed)
+        return route_tracking.make_action((target - speed) / response_s, route, speed, tracker, grade=grade)
 
-    return Policy(init, apply)
+    return route_tracking.make_planner(act, "ego", "route", planner="route_pursuit")

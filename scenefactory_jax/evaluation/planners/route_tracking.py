@@ -3,7 +3,7 @@
 Everything is elementwise over leading axes and concerns the car's own frame.
 """
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
 
 import jax.numpy as jnp
@@ -11,6 +11,7 @@ from jaxtyping import Array, Float
 
 from scenefactory_jax.core.geometry import cross, dot, safe_norm
 from scenefactory_jax.core.schema import ConfigError
+from scenefactory_jax.core.types import Observation, Policy
 from scenefactory_jax.evaluation.planners import tracker as tracking
 from scenefactory_jax.evaluation.planners.tracker import Tracker
 
@@ -39,6 +40,17 @@ def require_groups(observation: Mapping[str, Any], *names: str, planner: str, op
         raise ConfigError(
             f"policy: {planner} needs the observation groups of observations={option}; {groups} missing; the observation has: {has}"
         )
+
+
+def make_planner(act: Callable[[Observation], Float[Array, "*n 3"]], *groups: str, planner: str, option: str = "drive") -> Policy:
+    """Makes a policy of a function: without parameters and noise, its values are zero. The others as of `require_groups`."""
+
+    def apply(parameters, observation):
+        require_groups(observation, *groups, planner=planner, option=option)
+        action = act(observation)
+        return action, jnp.full(3, -jnp.inf), jnp.zeros_like(action[..., 0])
+
+    return Policy(lambda key, observation: {}, apply)
 
 
 def expand_length(compressed: Float[Array, "*n"], scale: float) -> Float[Array, "*n"]:

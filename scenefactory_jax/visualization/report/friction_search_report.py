@@ -74,7 +74,7 @@ def draw(found: Sequence[Found], scene: Scene, names: Sequence[str]) -> Figure:
         axes.set_axis_off()
     for axes, one in zip(panels, found, strict=False):
         world = jax.tree.map(lambda leaf, row=one.world: np.asarray(leaf)[row], scene)
-        end = _find_end(one)
+        end = min(one.step, len(one.driven.position) - 1)  # the state in which it fails; the first is the start
         points = np.concatenate([one.outline, one.dry.position, one.driven.position[: end + 1]])
         window = drawing.fit_view(points, margin=8.0, smallest=40.0)
         figures.draw_road(axes, world, window, inches=INCHES)
@@ -86,8 +86,3 @@ def draw(found: Sequence[Found], scene: Scene, names: Sequence[str]) -> Figure:
         figures.draw_car(axes, one.driven.position[end], float(one.driven.yaw[end]), size, drawing.colour_of(EGO))
         axes.set_title(f"{names[one.world][-24:]}\n{one.cover}, {one.extent_m:.1f} m: {one.failure.replace('_', ' ')}", fontsize=7)
     return figure
-
-
-def _find_end(one: Found) -> int:
-    """The state at which the drive fails; states are one control step apart, and the first is the start."""
-    return min(one.step, len(one.driven.position) - 1)

@@ -7,7 +7,6 @@ from scenefactory_jax.core import markdown
 from scenefactory_jax.evaluation import statistics
 from scenefactory_jax.evaluation.metrics.agent_metrics import METRICS
 from scenefactory_jax.evaluation.records import Records
-from scenefactory_jax.evaluation.statistics import Estimate
 from scenefactory_jax.visualization.report import tables
 from scenefactory_jax.visualization.report.planner_table import name_policy
 
@@ -56,14 +55,11 @@ def compare_pairs(pairs: Mapping[str, Pair], resampling: Mapping[str, int], *, h
     found = {(name, metric): row[metric] for name, row in differences.items() for metric in compared if metric in row}
     adjusted = statistics.adjust_holm({key: estimate.p for key, estimate in found.items() if estimate.p is not None})
     metrics = [metric for metric in compared if any((name, metric) in found for name in pairs)]
-    cells = {key: _format_difference(estimate, adjusted.get(key, 1.0)) for key, estimate in found.items()}
+    marks = {key: " \\*" if adjusted.get(key, 1.0) < LEVEL else "" for key in found}
+    cells = {key: tables.format_estimate(estimate, signed=True) + marks[key] for key, estimate in found.items()}
     rows = [[METRICS[metric].label, *(cells.get((name, metric), "") for name in pairs)] for metric in metrics]
     return [
         f"\\*: below {LEVEL:g} after Holm's correction for all {len(adjusted)} comparisons of this table; the others are no findings.",
         markdown.format_table([heading, *pairs], rows),
         tables.explain_marks([{metric: found[name, metric] for metric in metrics if (name, metric) in found} for name in pairs]),
     ]
-
-
-def _format_difference(estimate: Estimate, adjusted: float) -> str:
-    return tables.format_estimate(estimate, signed=True) + (" \\*" if adjusted < LEVEL else "")

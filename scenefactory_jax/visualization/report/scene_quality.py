@@ -17,9 +17,9 @@ from scenefactory_jax.core.safe_names import escape_for_terminal
 from scenefactory_jax.core.types import DRIVABLE, DRIVEWAY, EDGES, LANE_BIKE, LINES
 from scenefactory_jax.data.curation.quality_gate import Example, Finding, QualityRules, QualitySummary
 from scenefactory_jax.visualization.birds_eye import drawing
-from scenefactory_jax.visualization.birds_eye.drawing import Colour
+from scenefactory_jax.visualization.birds_eye.drawing import Colour, rgb
 from scenefactory_jax.visualization.birds_eye.traffic_shapes import MOVING
-from scenefactory_jax.visualization.report import plots
+from scenefactory_jax.visualization.report import document, plots
 
 MARK: Colour = (208, 28, 40)
 WAY: Colour = (0, 114, 178)
@@ -68,9 +68,7 @@ def write(
             parts += [f"### {name}", f"![{name}]({picture.name})", "\n".join(lines)]
     if summary.unread:
         parts += ["## Not read", "\n".join(f"- {escape_for_terminal(line)}" for line in summary.unread)]
-    path = folder / "quality.md"
-    path.write_text("\n\n".join(parts) + "\n", encoding="utf-8")
-    return path
+    return document.write(folder / "quality.md", *parts)
 
 
 def _format_numbers(entry: Mapping[str, Any]) -> str:
@@ -99,20 +97,20 @@ def _draw(axes: Axes, example: Example, window_m: float) -> None:
     concerned = [track for track in raw.tracks if track.id in finding.objects]
     left, bottom, side = drawing.fit_view(_shown(raw, finding, concerned), margin=8.0, smallest=window_m)
     points = _SIDE_INCHES * 72 / side  # a metre
-    axes.set(xlim=(left, left + side), ylim=(bottom, bottom + side), xticks=[], yticks=[], aspect="equal", facecolor=_rgb(drawing.GROUND))
+    axes.set(xlim=(left, left + side), ylim=(bottom, bottom + side), xticks=[], yticks=[], aspect="equal", facecolor=rgb(drawing.GROUND))
     for kinds, colour, width, thinnest in _LOOKS:
         lines = [_closed(line.xyz[:, :2], line.kind) for line in raw.roads if line.kind in kinds and len(line.xyz) > 1]
-        axes.add_collection(LineCollection(lines, colors=[_rgb(colour)], linewidths=max(width * points, thinnest), capstyle="round"))
+        axes.add_collection(LineCollection(lines, colors=[rgb(colour)], linewidths=max(width * points, thinnest), capstyle="round"))
     for line in raw.roads:
         if line.id in finding.roads and len(line.xyz):
-            axes.plot(*line.xyz[:, :2].T, color=_rgb(MARK), linewidth=1.6, marker="." if len(line.xyz) < 2 else None)
+            axes.plot(*line.xyz[:, :2].T, color=rgb(MARK), linewidth=1.6, marker="." if len(line.xyz) < 2 else None)
     others = [track for track in raw.tracks if track.kind == "vehicle" and track not in concerned]
     _draw_boxes(axes, others, step, MOVING)
     for track in concerned:
-        axes.plot(*track.xyz[track.valid, :2].T, color=_rgb(WAY), linewidth=1.2, marker=".", markersize=2)
+        axes.plot(*track.xyz[track.valid, :2].T, color=rgb(WAY), linewidth=1.2, marker=".", markersize=2)
     _draw_boxes(axes, concerned, step, WAY)
     if finding.xyz is not None:
-        look = {"marker": "o", "markersize": 16, "markerfacecolor": "none", "markeredgecolor": _rgb(MARK), "markeredgewidth": 1.6}
+        look = {"marker": "o", "markersize": 16, "markerfacecolor": "none", "markeredgecolor": rgb(MARK), "markeredgewidth": 1.6}
         axes.plot(*finding.xyz[:2], **look)
     label = {"transform": axes.transAxes, "fontsize": 6.5, "bbox": {"facecolor": "white", "alpha": 0.8, "linewidth": 0}, "zorder": 5}
     title = [part for line in (escape_for_terminal(raw.name), finding.message) for part in textwrap.wrap(line, _WRAP)]
@@ -133,15 +131,10 @@ def _draw_boxes(axes: Axes, tracks: Sequence[Track], step: int, colour: Colour) 
     there = [track for track in tracks if track.valid[step]]
     shapes = [drawing.car_shape(track.xyz[step, :2], float(track.yaw[step]), np.array(track.size[:2])) for track in there]
     boxes, arrows = [box for box, _ in shapes], [arrow for _, arrow in shapes]
-    axes.add_collection(PolyCollection(boxes, facecolors=[(*_rgb(colour), 0.45)], edgecolors=[_rgb(colour)], linewidths=0.6, zorder=3))
-    axes.add_collection(PolyCollection(arrows, facecolors=[_rgb(drawing.WHITE)], edgecolors="none", zorder=4))
+    axes.add_collection(PolyCollection(boxes, facecolors=[(*rgb(colour), 0.45)], edgecolors=[rgb(colour)], linewidths=0.6, zorder=3))
+    axes.add_collection(PolyCollection(arrows, facecolors=[rgb(drawing.WHITE)], edgecolors="none", zorder=4))
 
 
 def _closed(points: np.ndarray, kind: int) -> np.ndarray:
     """A driveway is the outline of a polygon."""
     return np.concatenate([points, points[:1]]) if kind == DRIVEWAY else points
-
-
-def _rgb(colour: Colour) -> tuple[float, float, float]:
-    red, green, blue = (channel / 255 for channel in colour)
-    return red, green, blue

@@ -30,6 +30,7 @@ def write(folder: Path, result: Result) -> Path:
     """Writes `folder`/NAME.md, which includes `folder`/interpretation.md, and its figures, and returns the path of the report."""
     study, interpretation = result["study"], folder / INTERPRETATION
     chosen = study.get("metrics")
+    known = [name for name in chosen or (*RATES, *SAFETY) if any(name in row["pooled"] for row in result["rows"])]
     figures = study_figures.draw_all(result).items()
     pictures = {caption: plots.save(figure, folder / f"{name}.png") for caption, (name, figure) in figures}
     return document.write(
@@ -46,7 +47,7 @@ def write(folder: Path, result: Result) -> Path:
         document.section("Each seed", document.fold("Values of each seed", _each_seed(result["rows"], chosen or RATES))),
         document.section("Trainings", *_trainings(result)),
         document.section("Scenes, and how often they were evaluated", *_scenes(result)),
-        document.section("Definitions", _definitions(result["rows"], chosen or (*RATES, *SAFETY))),
+        document.section("Definitions", tables.define_metrics(known)),
         document.section("How to repeat it", *_settings(result)),
     )
 
@@ -157,10 +158,6 @@ def _each_seed(rows: Sequence[Mapping[str, Any]], metrics: Sequence[str]) -> str
 
 def _format_value(name: str, value: float | None) -> str:
     return "" if value is None else format_estimate(Estimate(value, None, None, 1, METRICS[name].unit, statistics.NONE))
-
-
-def _definitions(rows: Sequence[Mapping[str, Any]], metrics: Sequence[str]) -> str:
-    return tables.define_metrics(name for name in metrics if any(name in row["pooled"] for row in rows))
 
 
 # ---- trainings

@@ -4,7 +4,6 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float
 
 from scenefactory_jax.core.raw_scene import LIGHT_STATES, RawScene
 from scenefactory_jax.core.types import STOP_SIGN
@@ -42,7 +41,10 @@ def find_posts(raw: RawScene, centre: Sequence[float]) -> RoadPosts:
         place = light.stop[:2] if light.stop is not None else None if lane is None else lane[0]
         if place is None:
             continue
-        ahead = np.array([1.0, 0.0]) if lane is None else _find_direction(lane, place)
+        ahead = np.array([1.0, 0.0])
+        if lane is not None:
+            nearest = min(int(np.argmin(np.linalg.norm(lane - place, axis=1))), len(lane) - 2)
+            ahead = lane[nearest + 1] - lane[nearest]
         changes, period = read_changes(light, raw.times, raw.current)
         begun = max((index for index, (time, _) in enumerate(changes) if time <= 0), default=0)
         shown = [(max(time, 0.0), LIGHT_STATES[state]) for time, state in changes[begun:]]
@@ -50,8 +52,3 @@ def find_posts(raw: RawScene, centre: Sequence[float]) -> RoadPosts:
         yaw = float(np.arctan2(ahead[1], ahead[0]))
         lights.append(Light((float(x), float(y)), yaw, shown, period if np.isfinite(period) else None))
     return RoadPosts(tuple(lights), tuple((float(x), float(y)) for x, y in signs))
-
-
-def _find_direction(line: Float[np.ndarray, "N 2"], place: Float[np.ndarray, "2"]) -> Float[np.ndarray, "2"]:
-    nearest = min(int(np.argmin(np.linalg.norm(line - place, axis=1))), len(line) - 2)
-    return line[nearest + 1] - line[nearest]

@@ -5,7 +5,7 @@ from collections import Counter
 import numpy as np
 import shapely
 
-from scenefactory_jax.core.raw_scene import RawScene, Track
+from scenefactory_jax.core.raw_scene import RawScene
 from scenefactory_jax.data.curation.quality_gate import Finding
 from scenefactory_jax.data.packing.pack import box_corners
 
@@ -64,14 +64,9 @@ def overlapping_starts(raw: RawScene, *, min_overlap_fraction: float) -> list[Fi
     common = shapely.area(shapely.intersection(boxes[one], boxes[other])) / np.minimum(area[one], area[other])
     found = []
     for first, second, part in zip(one, other, common, strict=True):
-        if part > min_overlap_fraction and _same_level(tracks[first], tracks[second], now):
-            ids = (tracks[first].id, tracks[second].id)
-            place = (tracks[first].xyz[now] + tracks[second].xyz[now]) / 2
+        a, b = tracks[first], tracks[second]
+        if part > min_overlap_fraction and abs(a.xyz[now, 2] - b.xyz[now, 2]) < (a.size[2] + b.size[2]) / 2:  # in height, too
+            ids, place = (a.id, b.id), (a.xyz[now] + b.xyz[now]) / 2
             message = f"vehicles {ids[0]} and {ids[1]} share {100 * part:.0f} % of the smaller box at the current step"
             found.append(Finding(message, float(part), min_overlap_fraction, place, now, ids))
     return found
-
-
-def _same_level(one: Track, other: Track, step: int) -> bool:
-    """Whether two boxes overlap in height, too."""
-    return bool(abs(one.xyz[step, 2] - other.xyz[step, 2]) < (one.size[2] + other.size[2]) / 2)

@@ -25,7 +25,7 @@ def speed(raw: RawScene, *, max_speed_m_s: float) -> list[Finding]:
 
 def acceleration(raw: RawScene, *, max_acceleration_m_s2: float, over_s: float) -> list[Finding]:
     """Logged speeds that change faster, measured over `over_s` to average the noise of single steps."""
-    stride = max(1, round(over_s / _step_s(raw)))
+    stride = max(1, round(over_s / (float(np.median(np.diff(raw.times))) if len(raw.times) > 1 else np.inf)))
 
     def measure(track: Track) -> Excess:
         there = np.flatnonzero(track.valid[stride:] & track.valid[:-stride])
@@ -137,7 +137,3 @@ def _vehicles(raw: RawScene) -> Iterator[Track]:
 def _neighbours(track: Track) -> Int[np.ndarray, " K"]:
     """Valid steps that precede a valid step."""
     return np.flatnonzero(track.valid[1:] & track.valid[:-1])
-
-
-def _step_s(raw: RawScene) -> float:
-    return float(np.median(np.diff(raw.times))) if len(raw.times) > 1 else np.inf
