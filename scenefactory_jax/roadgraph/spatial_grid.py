@@ -72,18 +72,17 @@ def _build_lists(
     """Segments of all cells, cell after cell, and the number of segments of each cell."""
     reach = int(np.ceil(radius_m / size_m)) + 1
     number = np.flatnonzero(valid).astype(np.int32)
-    points = midpoint[number].astype(np.float64) - origin
-    squares, cells, inside = [], [], []
-    for axis in (0, 1):  # from each point to the columns, then to the rows of cells around it
-        along = points[:, axis, None]
-        cell = np.floor(along / size_m).astype(np.int32) + np.arange(-reach, reach + 1, dtype=np.int32)
-        beyond = np.maximum(np.maximum(cell * size_m - along, along - (cell + 1) * size_m), 0.0)
-        squares.append(beyond * beyond)
-        cells.append(cell)
-        inside.append((cell >= 0) & (cell < side))
-    near = squares[1][:, :, None] + squares[0][:, None, :] <= (radius_m + SLACK_M) ** 2
-    near &= inside[1][:, :, None] & inside[0][:, None, :]
-    flat = (cells[1][:, :, None] * side + cells[0][:, None, :])[near]
-    segment = np.repeat(number, near.sum(axis=(1, 2)))  # ascending, and a stable sort keeps the order
+    points = (midpoint[number].astype(np.float64) - origin).T[:, None]
+    cell = np.floor(points / size_m).astype(np.int32) + np.arange(-reach, reach + 1, dtype=np.int32)[:, None]  # [axis, 2 reach + 1, segments]
+    beyond = np.maximum(np.maximum(cell * size_m - points, points - (cell + 1) * size_m), 0.0)
+    squares = np.where((cell >= 0) & (cell < side), beyond * beyond, np.inf)
+    before, after = np.zeros((2, *squares[1].shape), np.int32)  # columns of each row of cells within the radius: neighbours around the point's
+    for column, square in enumerate(squares[0]):
+        (before if column < reach else after)[...] += squares[1] + square <= (radius_m + SLACK_M) ** 2
+    counts = (before + after).T.ravel()
+    ends = np.cumsum(counts)
+    first = (cell[1] * side + cell[0, reach] - before).T.ravel()
+    flat = np.repeat(first - (ends - counts), counts) + np.arange(counts.sum())
+    segment = np.repeat(number, counts.reshape(len(number), 2 * reach + 1).sum(axis=1))  # ascending, and a stable sort keeps the order
     keys = flat.astype(np.uint16) if side * side <= 2**16 else flat  # numpy sorts 16 bits by radix, ten times as fast
     return segment[np.argsort(keys, kind="stable")], np.bincount(flat, minlength=side * side)
