@@ -161,7 +161,11 @@ def _measure_offsets(lanes: LaneMap, chains: list[tuple[int, ...]], track: Float
 
 
 def sample_chains(
-    lanes: LaneMap, chains: Sequence[tuple[int, ...]], starts: Float[np.ndarray, "K 2"], vertices: Int[np.ndarray, " K"], max_length_m: float
+    lanes: LaneMap,
+    chains: Sequence[tuple[int, ...]],
+    starts: Float[np.ndarray, "K 2"],
+    vertices: Int[np.ndarray, " K"],
+    max_length_m: float,
 ) -> list[SampledRoute]:
     """Samples chains of lanes from `starts`, places on their first lanes, on; `vertices`: the first one behind each (`_locate`)."""
     graph = lanes.graph
@@ -188,7 +192,7 @@ def sample_chains(
 
 
 def _locate(
-    graph: LaneGraph, lane: Sequence[int], along: Sequence[float]
+    graph: LaneGraph, lane: Sequence[int], along: Sequence[float] | Float[np.ndarray, " K"]
 ) -> tuple[Float[np.ndarray, "K 2"], Int[np.ndarray, " K"]]:
     """Places at lengths along lanes, and the first vertex behind each; `lane_graph.point_at` rounds otherwise."""
     first, end, at = graph.first[lane], graph.first[np.asarray(lane) + 1], np.clip(along, 0.0, graph.length[lane])
