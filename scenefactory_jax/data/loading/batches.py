@@ -142,7 +142,9 @@ def require_memory(sizes: Mapping[str, int], worlds: int, *, gib: float) -> None
 Row = tuple[Scene | str, int]  # a scene, or why it cannot be used, and the number of axes that were cut
 
 
-def load_rows(loader: BatchLoader, indices: Iterable[int | np.integer], sizes: Mapping[str, int], *, on_overflow: OnOverflow) -> Iterator[Row]:
+def load_rows(
+    loader: BatchLoader, indices: Iterable[int | np.integer], sizes: Mapping[str, int], *, on_overflow: OnOverflow
+) -> Iterator[Row]:
     """Loads scenes cut to fixed sizes, one after another.
 
     Raises:
