@@ -106,9 +106,10 @@ def _build_lists(
     beyond = np.maximum(np.maximum(cell * size_m - points, points - (cell + 1) * size_m), 0.0)
     squares = beyond * beyond
     squares[1][(cell[1] < 0) | (cell[1] >= side)] = np.inf
-    before, after = np.zeros((2, *squares[1].shape), np.int32)  # cells of a row within the radius are neighbours, around the point's
+    sides = np.zeros((2, *squares[1].shape), np.int32)  # cells of a row within the radius are neighbours, around the point's
     for column, square in enumerate(squares[0]):
-        (before if column < reach else after)[...] += squares[1] + square <= (radius_m + SLACK_M) ** 2
+        sides[int(column >= reach)] += squares[1] + square <= (radius_m + SLACK_M) ** 2
+    before, after = sides
     low, high = np.maximum(cell[0, reach] - before, 0), np.minimum(cell[0, reach] + after, side)
     counts = np.maximum(high - low, 0).T.ravel()
     ends = np.cumsum(counts, dtype=np.int32)

@@ -14,7 +14,7 @@ from support.scene_banks import stacked_scenes
 from support.scene_documents import document, thing, written
 from support.streets import street
 
-from experiments.benchmarks import streaming
+from experiments.benchmarks import loading, streaming
 from scenefactory_jax.cli import hydra_config
 from scenefactory_jax.core.instantiate import ConfigError, instantiate
 from scenefactory_jax.core.parallel import task_map
@@ -254,6 +254,11 @@ def test_every_world_holds_the_scene_that_the_stream_says():
         same(jax.tree.map(lambda leaf, world=world: np.asarray(leaf)[[world]], held), alone(found, index, told["sizes"]))
     settled = np.asarray(told["episodes"])[:12]
     assert (settled[3:] > 0).all() and told["draws"] == [1] * 24
+
+
+def test_loading_is_measured_alone():
+    found = loading.measure(entry("worlds=4") | {"warmup": 1, "repeats": 2})
+    assert found["scenes"] == 4 and found["scenes_per_s"] > 0 and found["ms_of_this_process_a_scene"] > 0
 
 
 def test_a_resumed_stream_brings_the_scenes_of_an_unbroken_one():

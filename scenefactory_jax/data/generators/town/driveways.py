@@ -48,7 +48,8 @@ def draw_driveways(
             continue
         if any(np.linalg.norm(middle - spot) < MIN_SPACING_M for spot, _ in spots):
             continue
-        if surface.intersects(shapely.Polygon(outline + 0.2 * out)) or surface.intersects(shapely.Point(middle).buffer(CLEARANCE_M)):
+        ground = (shapely.Polygon(outline + 0.2 * out), shapely.Point(middle).buffer(CLEARANCE_M))
+        if shapely.intersects(surface, ground).any():
             continue
         outlines.append(np.concatenate([outline, outline[:1]]))
         spots.append((middle, float(np.arctan2(out[1], out[0])) + np.pi * float(rng.integers(2))))
