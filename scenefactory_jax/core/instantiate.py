@@ -12,11 +12,10 @@ import importlib
 import inspect
 import math
 import types
-import typing
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
-from scenefactory_jax.core.schema import Bounds, ConfigError, check_names, read_value
+from scenefactory_jax.core.schema import Bounds, ConfigError, check_names, read_hints, read_value
 
 
 def instantiate(entry: Mapping[str, Any], *, builtins: types.ModuleType | str, where: str, **context: Any) -> Callable[..., Any]:
@@ -39,7 +38,7 @@ def instantiate(entry: Mapping[str, Any], *, builtins: types.ModuleType | str, w
     tunable = [name for name in parameters if name not in supplied]
 
     check_names(numbers, tunable, where=where, required=[name for name in tunable if parameters[name].default is inspect.Parameter.empty])
-    hints = typing.get_type_hints(inspect.unwrap(function), include_extras=True)
+    hints = read_hints(inspect.unwrap(function))
     values = {key: read_value(value, hints.get(key, Any), where=f"{where}.{key}") for key, value in numbers.items()}
     return functools.partial(function, **values, **supplied)
 

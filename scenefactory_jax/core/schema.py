@@ -13,6 +13,7 @@ Parameters of a function that `_target_` selects are checked by the same annotat
 """
 
 import dataclasses
+import functools
 import math
 import os
 import types
@@ -85,7 +86,7 @@ def read(config: Any, schema: type[T], *, where: str = "") -> T:
     fields = dataclasses.fields(typing.cast(Any, schema))
     required = [field.name for field in fields if field.default is field.default_factory is dataclasses.MISSING]
     check_names(config, [field.name for field in fields], where=where, required=required)
-    hints = typing.get_type_hints(schema, include_extras=True)
+    hints = read_hints(schema)
     values = {name: read_value(value, hints[name], where=_join(where, name)) for name, value in config.items()}
     try:
         return schema(**values)
@@ -107,6 +108,12 @@ def check_names(config: Mapping[str, Any], valid: list[str], *, where: str, requ
 
 def _join(where: str, key: Any) -> str:
     return f"{where}.{key}" if where else str(key)
+
+
+@functools.cache
+def read_hints(target: Any) -> Mapping[str, Any]:
+    """The annotations of a dataclass or of a function."""
+    return typing.get_type_hints(target, include_extras=True)
 
 
 def read_value(value: Any, hint: Any, *, where: str) -> Any:

@@ -160,7 +160,10 @@ def convert_entry(item: tuple[int, Entry], *, out: Path, tools: SceneTools) -> S
             rows.append(row | {"packing": trial if isinstance(trial, str) else catalogue.PACKED})
             yield batch
 
-    part = bank_writer.write_part(out, number, batches())
+    try:
+        part = bank_writer.write_part(out, number, batches())
+    except OSError as error:  # as a reject, a full disk would cost one file after another
+        raise ConfigError(f"out: {out}: {error.strerror}; the same command goes on once there is room") from error
     return SourceFileResult(entry.name, part=part, rows=tuple(rows), **list_entries(rejects), account=count_results(trials))
 
 

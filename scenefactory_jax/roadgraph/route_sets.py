@@ -4,8 +4,10 @@ ScenarioMax (`converter/path.py`): from the lanes near a track's first position 
 track. Here chains end where they are long enough, because all chains of ten lanes are too many at large junctions.
 """
 
+import bisect
+import math
 from collections import deque
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -22,6 +24,8 @@ ROOT_COSINE = 0.5  # between lane and car
 MAX_LANES = 10  # of a chain
 BOUND_SLACK_M = 1e-6  # far above the rounding of a distance
 STRIDE = 4  # vertices of a lane of which one is looked at first
+MIN_STEP_M = 1e-3  # between vertices of a route
+DRAWS = 64  # of routes that are looked at together
 MAX_CHAINS = 400  # from one root: at the largest junctions chains of later branches are left out
 
 
@@ -85,7 +89,9 @@ def find_track_routes(
     order = sorted(range(len(kept)), key=lambda place: float(offsets[place].sum()))[:count]
     if offsets[order[0]].max() > max_distance_m:
         return [sample_track(track, max_length_m)]
-    found = [sample_chain(lanes, kept[place], track[0], max_length_m) for place in order]
+    chosen = [kept[place] for place in order]
+    along = shapely.line_locate_point(lanes.shapes[[chain[0] for chain in chosen]], shapely.Point(track[0]))
+    found = sample_chains(lanes, chosen, *_locate(lanes.graph, [chain[0] for chain in chosen], along), max_length_m)
     end = int(np.argmin(np.linalg.norm(found[0].xy - track[-1], axis=1)))
     beginning = found[0].xy[: end + 1]
     return [
@@ -154,62 +160,76 @@ def _measure_offsets(lanes: LaneMap, chains: list[tuple[int, ...]], track: Float
     return [distance[member].min(axis=0) for member in members]
 
 
-def sample_chain(lanes: LaneMap, chain: tuple[int, ...], start: Float[np.ndarray, "2"], max_length_m: float) -> SampledRoute:
-    """Samples a chain of lanes from the point of its first lane that is nearest to `start`."""
-    behind = float(shapely.line_locate_point(lanes.shapes[chain[0]], shapely.Point(start)))
-    return sample_lanes(lanes, chain, behind, max_length_m)
-
-
-def sample_lanes(lanes: LaneMap, chain: tuple[int, ...], behind: float, max_length_m: float) -> SampledRoute:
-    """Samples a chain of lanes from a length along its first lane."""
+def sample_chains(
+    lanes: LaneMap,
+    chains: Sequence[tuple[int, ...]],
+    starts: Float[np.ndarray, "K 2"],
+    vertices: Int[np.ndarray, " K"],
+    max_length_m: float,
+) -> list[SampledRoute]:
+    """Samples chains of lanes from `starts`, places on their first lanes, on; `vertices`: the first one behind each (`_locate`)."""
     graph = lanes.graph
-    pieces, owners = [], []
-    for place, lane in enumerate(chain):
-        line, arc = _take_lane(graph, lane)
-        if place == 0:
-            line = np.concatenate([_point_on(line, arc, behind)[None], line[arc > behind]])
-        pieces.append(line)
-        owners.append(np.full(len(line), lane))
-    xy, length, nearest = resample(np.concatenate(pieces), max_length_m)
-    return SampledRoute(xy, np.concatenate(owners)[nearest], length, chain, on_route=False, along_lanes=True)
+    rows, heads = np.array([lane for chain in chains for lane in chain], int), np.cumsum([0, *map(len, chains)])[:-1]
+    first, counts = graph.first[rows], np.diff(graph.first)[rows]
+    counts[heads] -= vertices - first[heads]
+    first[heads] = vertices
+    first[heads], counts[heads] = first[heads] - 1, counts[heads] + 1  # a row for the start
+    bounds = np.cumsum(counts)
+    begins = bounds - counts
+    xy = graph.xyz[np.repeat(first - begins, counts) + np.arange(bounds[-1]), :2]
+    xy[begins[heads]] = starts
+    used = np.ones(len(xy), bool)
+    used[1:] = segment_lengths(xy[1:] - xy[:-1]) > MIN_STEP_M
+    used[begins[heads]] = True
+    xy, owner = xy[used], np.repeat(rows, counts)[used]
+    step = segment_lengths(xy[1:] - xy[:-1])
+    parts = np.append(np.cumsum(used)[begins[heads]] - 1, len(xy)).tolist()
+    found = []
+    for chain, begin, end in zip(chains, parts[:-1], parts[1:], strict=True):
+        points, length, nearest = _place_points(xy[begin:end], step[begin : end - 1], max_length_m)
+        found.append(SampledRoute(points, owner[begin + nearest], length, chain, on_route=False, along_lanes=True))
+    return found
 
 
-def _take_lane(graph: LaneGraph, lane: int) -> tuple[Float[np.ndarray, "V 2"], Float[np.ndarray, " V"]]:
-    """The vertices of one lane, and the length along it up to each."""
-    rows = slice(graph.first[lane], graph.first[lane + 1])
-    return graph.xyz[rows, :2], graph.arc[rows]
-
-
-def _point_on(line: Float[np.ndarray, "V 2"], arc: Float[np.ndarray, " V"], at: float) -> Float[np.ndarray, "2"]:
-    """The point at a length along one lane, as `lane_graph.point_at` computes it for many."""
-    at = min(max(at, 0.0), arc[-1])
-    segment = min(int(np.searchsorted(arc, at, side="right")) - 1, len(arc) - 2)
-    return line[segment] + (at - arc[segment]) / (arc[segment + 1] - arc[segment]) * (line[segment + 1] - line[segment])
+def _locate(
+    graph: LaneGraph, lane: Sequence[int], along: Sequence[float] | Float[np.ndarray, " K"]
+) -> tuple[Float[np.ndarray, "K 2"], Int[np.ndarray, " K"]]:
+    """Places at lengths along lanes, and the first vertex behind each; `lane_graph.point_at` rounds otherwise."""
+    first, end, at = graph.first[lane], graph.first[np.asarray(lane) + 1], np.clip(along, 0.0, graph.length[lane])
+    spans = zip(first.tolist(), end.tolist(), at.tolist(), strict=True)
+    behind = np.array([low + graph.arc[low:high].searchsorted(place, side="right") for low, high, place in spans], int)
+    segment = np.minimum(behind, end - 1) - 1
+    fraction = (at - graph.arc[segment]) / (graph.arc[segment + 1] - graph.arc[segment])
+    begin = graph.xyz[segment, :2]
+    return begin + fraction[:, None] * (graph.xyz[segment + 1, :2] - begin), behind
 
 
 def sample_track(track: Float[np.ndarray, "L 2"], max_length_m: float) -> SampledRoute:
     """Samples a track as a route of its own, beside lanes."""
-    xy, length, _ = resample(track, max_length_m)
+    xy, length = _resample(track, max_length_m)
     return SampledRoute(xy, np.full(len(xy), -1), length, (), on_route=True, along_lanes=False)
 
 
-def resample(line: Float[np.ndarray, "V 2"], max_length_m: float) -> tuple[Float[np.ndarray, "N 2"], float, Int[np.ndarray, " N"]]:
-    """Points every ROUTE_SPACING_M along a line and its end, the length, and the vertex at or after each point."""
-    step = segment_lengths(line[1:] - line[:-1])
-    used = np.concatenate([[0], 1 + np.flatnonzero(step > 1e-3)])
-    if len(used) < len(line):
-        line = line[used]
-        step = segment_lengths(line[1:] - line[:-1])
+def _resample(line: Float[np.ndarray, "V 2"], max_length_m: float) -> tuple[Float[np.ndarray, "N 2"], float]:
+    """Points every ROUTE_SPACING_M along a line and its end, and the length."""
+    line = line[np.append(True, segment_lengths(line[1:] - line[:-1]) > MIN_STEP_M)]
+    return _place_points(line, segment_lengths(line[1:] - line[:-1]), max_length_m)[:2]
+
+
+def _place_points(
+    line: Float[np.ndarray, "V 2"], step: Float[np.ndarray, " S"], max_length_m: float
+) -> tuple[Float[np.ndarray, "N 2"], float, Int[np.ndarray, " N"]]:
+    """Points every ROUTE_SPACING_M along a line of segments of these lengths and its end, the length, and the vertex at or after each."""
     arc = np.zeros(len(line))
     np.cumsum(step, out=arc[1:])
     length = min(float(arc[-1]), max_length_m)
-    places = np.append(np.arange(0.0, length, ROUTE_SPACING_M), length)
-    if len(places) > 1 and places[-1] - places[-2] < 1e-3:
-        places = np.delete(places, -2)
-    xy = np.empty((len(places), 2))
-    for axis in (0, 1):
-        xy[:, axis] = np.interp(places, arc, line[:, axis])
-    return xy, length, used[np.minimum(np.searchsorted(arc, places), len(arc) - 1)]
+    count = math.ceil(length / ROUTE_SPACING_M)
+    if count and length - ROUTE_SPACING_M * (count - 1) < MIN_STEP_M:
+        count -= 1
+    places = ROUTE_SPACING_M * np.arange(count + 1.0)
+    places[-1] = length
+    xy = np.stack([np.interp(places, arc, line[:, axis]) for axis in (0, 1)], axis=1)
+    return xy, length, np.minimum(arc.searchsorted(places), len(arc) - 1)
 
 
 def draw_routes(
@@ -236,41 +256,53 @@ def draw_routes(
     if not len(graph.id):
         return []
     chance = np.cumsum(graph.length / graph.length.sum())
-    chance /= chance[-1]
+    chance, lengths = (chance / chance[-1]).tolist(), graph.length.tolist()
     most_winding = round(count * turn_fraction)
-    for _ in range(attempts):  # the draws are those of `rng.choice`, which checks its arguments each time
-        lane = int(np.searchsorted(chance, rng.random(), side="right"))
-        behind = float(rng.uniform(0.0, graph.length[lane]))
-        chain, length = [lane], float(graph.length[lane]) - behind
-        while length < length_m[1] and (further := [row for row in lanes.successors[chain[-1]] if row not in chain]):
-            chain.append(further[int(rng.integers(0, len(further)))])
-            length += float(graph.length[chain[-1]])
-        if np.abs(_point_on(*_take_lane(graph, lane), behind) - centre).max() > half_m:
-            continue  # it begins outside
-        route = cut_to_square(sample_lanes(lanes, tuple(chain), behind, length_m[1]), centre, half_m)
-        if route is not None and route.length >= length_m[0]:
-            (winding if is_winding(route.xy) else straight).append(route)
+    for first in range(0, attempts, DRAWS):
+        drawn = [_draw_chain(lanes, rng, chance, lengths, length_m[1]) for _ in range(min(DRAWS, attempts - first))]
+        starts, vertices = _locate(graph, [chain[0] for chain, _ in drawn], [behind for _, behind in drawn])
+        inside = np.flatnonzero(np.abs(starts - centre).max(axis=1) <= half_m)
+        chains = [drawn[place][0] for place in inside.tolist()]
+        for route in sample_chains(lanes, chains, starts[inside], vertices[inside], length_m[1]) if chains else ():
+            cut = cut_to_square(route, centre, half_m)
+            if cut is not None and cut.length >= length_m[0]:
+                (winding if is_winding(cut.xy) else straight).append(cut)
         if len(winding) >= most_winding and len(winding) + len(straight) >= count and len(straight) >= count - most_winding:
             break
     chosen = winding[: max(most_winding, count - len(straight))]
     return [*chosen, *straight[: count - len(chosen)]]
 
 
+def _draw_chain(
+    lanes: LaneMap, rng: np.random.Generator, chance: list[float], lengths: list[float], max_length_m: float
+) -> tuple[tuple[int, ...], float]:
+    """Draws a chain of lanes and a length along the first one; the draws are those of `rng.choice` and `rng.uniform`, in less time."""
+    lane = bisect.bisect_right(chance, rng.random())
+    behind = lengths[lane] * rng.random()
+    chain, length = [lane], lengths[lane] - behind
+    while length < max_length_m and (further := [row for row in lanes.successors[chain[-1]] if row not in chain]):
+        chain.append(further[int(rng.integers(0, len(further))) if len(further) > 1 else 0])
+        length += lengths[chain[-1]]
+    return tuple(chain), behind
+
+
 def cut_to_square(route: SampledRoute, centre: Float[np.ndarray, "2"], half_m: float) -> SampledRoute | None:
     """The route until it leaves a square; None if it begins outside, or is shorter than one step."""
     away = np.abs(route.xy - centre)
-    outside = np.flatnonzero(np.maximum(away[:, 0], away[:, 1]) > half_m)
-    if not len(outside):
-        return route if len(route.xy) > 1 else None
-    end = int(outside[0])
+    outside = np.maximum(away[:, 0], away[:, 1]) > half_m
+    end = int(outside.argmax()) if outside.any() else len(outside)
     if end < 2:
         return None
+    if end == len(outside):
+        return route
     return route._replace(xy=route.xy[:end], lane=route.lane[:end], length=ROUTE_SPACING_M * (end - 1))
 
 
 def is_winding(xy: Float[np.ndarray, "N 2"], *, turn_deg: float = 45.0, detour: float = 1.15) -> bool:
     """Whether a route turns by 45 degrees or more, or is 1.15 times longer than its chord (the suite `route100`'s definition)."""
-    step = np.diff(xy, axis=0)
-    heading = np.unwrap(np.arctan2(step[:, 1], step[:, 0]))
-    length, chord = segment_lengths(step).sum(), np.linalg.norm(xy[-1] - xy[0])
-    return bool(np.ptp(heading) >= np.deg2rad(turn_deg) or length >= detour * chord)
+    step = xy[1:] - xy[:-1]
+    heading = np.arctan2(step[:, 1], step[:, 0])
+    if np.abs(heading[1:] - heading[:-1]).max(initial=0.0) >= np.pi:
+        heading = np.unwrap(heading)
+    turned = heading.max() - heading.min() >= np.deg2rad(turn_deg)
+    return bool(turned or segment_lengths(step).sum() >= detour * np.linalg.norm(xy[-1] - xy[0]))

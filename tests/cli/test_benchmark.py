@@ -13,6 +13,8 @@ from scenefactory_jax.cli import schema
 from scenefactory_jax.cli.hydra_config import load_config
 from scenefactory_jax.core import result_file
 from scenefactory_jax.core.instantiate import ConfigError
+from scenefactory_jax.core.schema import read
+from scenefactory_jax.data.loading.stream import StreamConfig
 from scenefactory_jax.learning import phase_timing
 from scenefactory_jax.visualization.report import throughput_report as report
 
@@ -78,7 +80,10 @@ def test_the_whole_configuration_comes_first():
     assert (name, changes) == ("256 x 16", {"phases": True})
     full = config["variants"]["bicycle environment 4096 x 16, no empty slots"]
     assert full["dynamics"]["_target_"].endswith("bicycle.make") and full["spawning"]["sampler"]["_target_"] == "random_pairs"
-    assert next(iter(load_config("benchmark", "suite=streaming")["variants"])) == "in memory"
+    (first, memory), *streams = load_config("benchmark", "suite=streaming")["variants"].items()
+    assert first == "in memory" and memory["stream"] is None
+    swapped = {name: read(changes["stream"], StreamConfig).swap_fraction for name, changes in streams}
+    assert swapped["fixed sizes"] == 0.0 and swapped["shuffled 1 of 4"] == 0.25
 
 
 def test_there_must_be_something_to_resume(tmp_path):

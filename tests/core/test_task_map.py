@@ -106,6 +106,17 @@ def twice(item):
     return 2 * item
 
 
-def test_processes_stay_between_calls():
+def test_processes_stay_between_calls_and_items_are_taken_one_by_one():
+    waiting, taken = [1, 2], []
+
+    def take():
+        while waiting:
+            taken.append(waiting.pop(0))
+            yield taken[-1]
+
     with open_pool(1) as task_map:
         assert [list(task_map(twice, items)) for items in ([1, 2], [], [3])] == [[2, 4], [], [6]]
+        results = task_map(twice, take())
+        assert next(iter(results)) == 2 and taken == [1, 2]  # the process has the second already
+        waiting.append(3)
+        assert list(results) == [4, 6]

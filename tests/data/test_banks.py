@@ -465,6 +465,18 @@ def test_a_killed_conversion_goes_on_where_it_stopped(tmp_path, number, kept):
     assert sorted(path.name[0] for path in out.iterdir())[0] == "b"
 
 
+def test_a_full_disk_ends_a_conversion_in_place_of_rejecting_every_file(tmp_path):
+    resource = pytest.importorskip("resource")  # a limit on files stands for a full disk: the same path, with another reason
+    folder, before = streets(tmp_path / "in", "a"), resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (1500, before[1]))
+    try:
+        with pytest.raises(ConfigError, match=r"out: .*bank: .*File too large; the same command goes on once there is room"):
+            conversion.convert(folder, tmp_path / "bank", **options())
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+    assert conversion.convert(folder, tmp_path / "bank", **options()).scenes == 1
+
+
 def test_one_command_at_a_time_writes_a_bank(tmp_path, made):
     folder, out, raws = streets(tmp_path / "in", "a", "b", "c"), tmp_path / "deep" / "bank", made[0]
     writers = {

@@ -14,7 +14,7 @@ from support.scene_banks import stacked_scenes
 from support.scene_documents import document, thing, written
 from support.streets import street
 
-from experiments.benchmarks import streaming
+from experiments.benchmarks import loading, streaming
 from scenefactory_jax.cli import hydra_config
 from scenefactory_jax.core.instantiate import ConfigError, instantiate
 from scenefactory_jax.core.parallel import task_map
@@ -220,7 +220,13 @@ def flowing(found):
 
 def alone(found, index, sizes):
     """One street, stacked by itself at the stream's sizes."""
-    return batches.load(loader_of(found), [index], sizes, on_overflow="cut").scene
+    return load(loader_of(found), [index], sizes).scene
+
+
+def load(loader, indices, sizes, how="cut"):
+    """A batch of these entries."""
+    rows = list(batches.load_rows(loader, indices, sizes, on_overflow=how))
+    return batches.stack_rows(loader.source, indices, rows, sizes)
 
 
 def loader_of(found):
@@ -248,6 +254,11 @@ def test_every_world_holds_the_scene_that_the_stream_says():
         same(jax.tree.map(lambda leaf, world=world: np.asarray(leaf)[[world]], held), alone(found, index, told["sizes"]))
     settled = np.asarray(told["episodes"])[:12]
     assert (settled[3:] > 0).all() and told["draws"] == [1] * 24
+
+
+def test_loading_is_measured_alone():
+    found = loading.measure(entry("worlds=4") | {"warmup": 1, "repeats": 2})
+    assert found["scenes"] == 4 and found["scenes_per_s"] > 0 and found["ms_of_this_process_a_scene"] > 0
 
 
 def test_a_resumed_stream_brings_the_scenes_of_an_unbroken_one():
@@ -281,7 +292,7 @@ def test_a_bank_and_a_generator_stream_the_same_scenes(tmp_path, monkeypatch):
     loaders = [loader_of(one) for one in (found, banked)]
     sources, sizes = [one.source for one in loaders], [measured(one, sample=5, side=60) for one in loaders]
     assert [one.count for one in sources] == [None, 5] and sizes[0] == sizes[1] and sources[1].name(3) == "street 3"
-    generated, loaded = (batches.load(one, [4, 1, 4], sizes[0], on_overflow="cut") for one in loaders)
+    generated, loaded = (load(one, [4, 1, 4], sizes[0]) for one in loaders)
     same(generated.scene, loaded.scene)
     packing = scene_source.make_packing(found["scenes"])
     whole, _ = stacked_scenes(written_bank, [4, 1, 4], capacity={axis: sizes[0][axis] for axis in batches.AXES}, **packing)
@@ -299,22 +310,21 @@ def test_files_stream_and_what_cannot_be_used_is_left_out_by_name(tmp_path):
     files = loader_of(found)
     assert files.source.count == 3 and files.source.name(0).endswith("broken.json")
     sizes = measured(files)
-    batch = batches.load(files, [0, 1, 2], sizes, on_overflow="cut")
+    batch = load(files, [0, 1, 2], sizes)
     assert list(batch.indices) == [1, 1, 2] and list(batch.refused) == [str(tmp_path / "broken.json")]
     with pytest.raises(SceneError, match=r"none of 1 scenes to load can be used: .*broken\.json: .*unknown format"):
-        batches.load(files, [0], sizes, on_overflow="cut")
+        load(files, [0], sizes)
 
 
 def test_scenes_above_the_capacity_are_cut_or_left_out_and_counted():
     found = entry()
     streets = loader_of(found)
     sizes = measured(streets, road=210, lanes=70, edges=140)  # streets 0 to 2 fit
-    load = lambda how, **changes: batches.load(streets, range(8), sizes | changes, on_overflow=how)  # noqa: E731
-    cut, skipped = load("cut"), load("skip")
+    cut, skipped = (load(streets, range(8), sizes, how) for how in ("cut", "skip"))
     assert (cut.cut, list(cut.indices), cut.refused) == (5, list(range(8)), {})
     assert (skipped.cut, list(skipped.indices[:3]), len(skipped.refused)) == (0, [0, 1, 2], 5) and set(skipped.indices) == {0, 1, 2}
     assert "cut to capacity lanes=70" in skipped.refused["generated scene 7"]
-    small = load("cut", side=20)
+    small = load(streets, range(8), sizes | {"side": 20})
     assert small.refused and all("capacity.side: expected at least" in reason for reason in small.refused.values())
 
 

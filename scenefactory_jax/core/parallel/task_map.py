@@ -7,6 +7,7 @@ Entries of `conf/spread/` name the functions `local` and `ray`.
 
 import contextlib
 import importlib
+import itertools
 import pickle
 import signal
 import time
@@ -24,7 +25,7 @@ IN_PROCESS = "spread=local scenes.workers=1 spread.timeout_s=null works without 
 PATIENCE_S = 20.0  # for processes that are asked to stop, before they are killed; schedulers kill after 30 s
 NO_ACCELERATOR = {"JAX_PLATFORMS": "cpu"}
 Work = Callable[[Any], Any]
-TaskMap = Callable[[Work, Sequence[Any]], Iterable[Any]]
+TaskMap = Callable[[Work, Iterable[Any]], Iterable[Any]]
 
 
 @contextlib.contextmanager
@@ -51,7 +52,7 @@ def open_pool(
     pool.close(None if stops else signal.SIGKILL)
 
 
-def in_process(work: Work, items: Sequence[Any]) -> Iterator[Any]:
+def in_process(work: Work, items: Iterable[Any]) -> Iterator[Any]:
     """Maps in this process."""
     return (_checked(worker.run_work(work, item)) for item in items)
 
@@ -117,15 +118,19 @@ class _Pool:
         self._workers: list[Worker] = []
         self._closed = False  # perhaps by another thread than that of `run`
 
-    def run(self, work: Work, items: Sequence[Any]) -> Iterator[Any]:
-        packed, waiting, done = _pack(work, pickle.dumps), deque(enumerate(items)), {}
+    def run(self, work: Work, items: Iterable[Any]) -> Iterator[Any]:
+        """Results in the order of the items; an item is taken when a process has nothing to do."""
+        packed, source, waiting, done, number = _pack(work, pickle.dumps), enumerate(items), deque[tuple[int, Any]](), {}, 0
         try:
-            self._assign(packed, waiting)
-            for number in range(len(items)):
-                while number not in done:
+            while True:
+                self._assign(packed, source, waiting)
+                if number in done:
+                    yield _checked(done.pop(number))
+                    number += 1
+                elif any(one.task is not None for one in self._workers):
                     self._collect(done)
-                    self._assign(packed, waiting)
-                yield _checked(done.pop(number))
+                else:
+                    return
         finally:
             for busy in [one for one in self._workers if one.task is not None and not self._stops]:
                 self._workers.remove(busy)
@@ -140,15 +145,15 @@ class _Pool:
         for one in list(self._workers):
             one.end(number, patience_s=None if number is None else max(0.0, end - time.monotonic()))
 
-    def _assign(self, packed: bytes, waiting: deque[tuple[int, Any]]) -> None:
-        """Sends the next items to idle processes, and to new ones up to their number."""
-        while waiting:
+    def _assign(self, packed: bytes, source: Iterator[tuple[int, Any]], waiting: deque[tuple[int, Any]]) -> None:
+        """Sends the next items to idle processes, and to new ones up to their number; `waiting`: an item that was taken but not sent."""
+        while (idle := next((one for one in self._workers if one.task is None), None)) or len(self._workers) < len(self._environments):
+            waiting.extend(itertools.islice(source, 1 - len(waiting)))
+            if not waiting:
+                return
             if self._closed:
                 raise RuntimeError("the pool of processes is closed")
-            idle = next((one for one in self._workers if one.task is None), None)
             if idle is None:
-                if len(self._workers) == len(self._environments):
-                    return
                 idle = Worker(self._environments[len(self._workers)], stops=self._stops)
                 self._workers.append(idle)
             number, item = waiting[0]

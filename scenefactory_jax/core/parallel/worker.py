@@ -82,7 +82,7 @@ def serve(descriptor: str, parent: str, stops: str) -> None:
     try:
         connection.send(None)
         while True:
-            connection.send(run_task(*connection.recv()))
+            connection.send_bytes(pickle.dumps(run_task(*connection.recv()), pickle.HIGHEST_PROTOCOL))  # arrays without a further copy
     except (EOFError, OSError):
         return
 

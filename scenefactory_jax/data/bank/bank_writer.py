@@ -18,7 +18,7 @@ import pyarrow as pa
 from jaxtyping import Int
 
 from scenefactory_jax.core import folder_lock
-from scenefactory_jax.core.atomic_file import write_atomically
+from scenefactory_jax.core.atomic_file import name_file, write_atomically
 from scenefactory_jax.core.raw_scene import SceneError
 from scenefactory_jax.data.bank import arrow_codec, bank_index, catalogue, shard_files
 from scenefactory_jax.data.bank.bank_index import Index, Shard
@@ -115,7 +115,7 @@ def add_accounts(one: Mapping[str, Any], other: Mapping[str, Any]) -> dict[str, 
 def write_part(folder: Path, number: int, batches: Iterable[pa.RecordBatch]) -> Path:
     """Writes the scenes of one source file to a file that `append_files` reads."""
     path = folder / f".part-{number:07d}-{uuid.uuid4().hex}.arrow"  # a process of a killed command may still write its own
-    with _open_writer(path, arrow_codec.SCHEMA, None) as writer:
+    with name_file(path), _open_writer(path, arrow_codec.SCHEMA, None) as writer:
         for batch in batches:
             writer.write_batch(batch)
     return path

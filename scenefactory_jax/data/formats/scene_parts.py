@@ -105,7 +105,9 @@ def make_light(lane: int, codes: Int[np.ndarray, " L"], stop: Float[np.ndarray, 
 
 def to_xyz(table: Float[np.ndarray, "N D"]) -> Float[np.ndarray, "N 3"]:
     """Points with height 0 where they have none."""
-    return np.pad(table, ((0, 0), (0, 3 - table.shape[1])))
+    if table.shape[1] == 3:
+        return table
+    return np.concatenate([table, np.zeros((len(table), 3 - table.shape[1]))], axis=1)
 
 
 def assign_ids(keys: Iterable[Any]) -> dict[str, int]:

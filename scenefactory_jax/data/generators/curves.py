@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Float
 
-from scenefactory_jax.core.scene_arrays import wrap_angles
+from scenefactory_jax.core.scene_arrays import segment_lengths, wrap_angles
 
 FINE_M = 0.25  # spacing of the points of all computed curves; scenes have coarser ones
 Points = Float[np.ndarray, "_ 2"]
@@ -14,7 +14,9 @@ Curve = tuple[Float[np.ndarray, "N 2"], Float[np.ndarray, " N"]]
 
 def heading(yaw: float | Float[np.ndarray, "*n"]) -> Float[np.ndarray, "*n 2"]:
     """Computes the unit vector in the direction of a yaw."""
-    return np.stack([np.cos(yaw), np.sin(yaw)], axis=-1)
+    unit = np.empty((*np.shape(yaw), 2))
+    unit[..., 0], unit[..., 1] = np.cos(yaw), np.sin(yaw)
+    return unit
 
 
 def wrap_angle(angle: float) -> float:
@@ -30,7 +32,9 @@ def smoothstep(fraction: Float[np.ndarray, " N"]) -> Float[np.ndarray, " N"]:
 
 def arc_length(points: Points) -> Float[np.ndarray, " N"]:
     """Computes the distance along the polyline from its first point, m."""
-    return np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))])
+    place = np.zeros(len(points))
+    np.cumsum(segment_lengths(points[1:] - points[:-1]), out=place[1:])
+    return place
 
 
 def tangents(points: Points) -> Float[np.ndarray, " N"]:
@@ -86,7 +90,9 @@ def easing_bend(length: float, turn: float, radius: float, easing: float, *, lea
 
 def interpolate(at: float | Sequence[float] | np.ndarray, place: Float[np.ndarray, " N"], points: Points) -> Float[np.ndarray, "*m 2"]:
     """Computes points of a polyline at places along it; `place` is the place of each of its points."""
-    return np.stack([np.interp(at, place, points[:, 0]), np.interp(at, place, points[:, 1])], axis=-1)
+    found = np.empty((*np.shape(at), 2))
+    found[..., 0], found[..., 1] = np.interp(at, place, points[:, 0]), np.interp(at, place, points[:, 1])
+    return found
 
 
 def resample(points: Points, spacing: float) -> Points:

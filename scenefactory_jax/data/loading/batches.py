@@ -1,21 +1,22 @@
 """Scenes of a source as batches of fixed sizes, so that they share a compiled program: what a stream loads."""
 
 import functools
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal, NamedTuple
 
-import jax
 import numpy as np
 
 from scenefactory_jax.core.instantiate import ConfigError
 from scenefactory_jax.core.parallel.task_map import FailedTask, TaskMap
+from scenefactory_jax.core.pytree import unchecked
 from scenefactory_jax.core.raw_scene import RawScene, SceneError
 from scenefactory_jax.core.types import Scene
 from scenefactory_jax.data.loading.scene_source import Check, Pack, SceneSource
 from scenefactory_jax.data.packing import columns
 from scenefactory_jax.data.packing.pack import prepare
-from scenefactory_jax.data.packing.stack import AXES, MAY_BE_EMPTY, describe, round_rows, stack
+from scenefactory_jax.data.packing.stack import AXES, MAY_BE_EMPTY, cut_scene, describe, pad_scenes, round_rows, stack
 from scenefactory_jax.roadgraph import spatial_grid
 
 OnOverflow = Literal["cut", "skip"]
@@ -33,16 +34,25 @@ class BatchLoader:
     grid: Mapping[str, Any]  # radius and cell size of the road grid; radius None: no grid
     task_map: TaskMap
 
-    def each(self, work: Callable[[Any], Any], indices: Sequence[int] | np.ndarray) -> Iterator[Any]:
+    def each(self, work: Callable[[Any], Any], indices: Iterable[int | np.integer]) -> Iterator[Any]:
         """The results of `work` for entries, in their order, where `work` gets a function that reads and packs the scene.
+
+        An entry is taken from `indices` when a process has nothing to do.
 
         Raises:
             RuntimeError: an error of the program rather than of the scene, with the scene's name.
         """
-        jobs = [functools.partial(_prepare, self.source.read_one(int(index)), self.check, self.pack) for index in indices]
-        for index, result in zip(indices, self.task_map(work, jobs), strict=True):
+        begun: deque[int] = deque()
+
+        def jobs() -> Iterator[Callable[[], Scene]]:
+            for index in indices:
+                begun.append(int(index))
+                yield functools.partial(_prepare, self.source.read_one(begun[-1]), self.check, self.pack)
+
+        for result in self.task_map(work, jobs()):
+            index = begun.popleft()
             if isinstance(result, FailedTask):
-                raise RuntimeError(f"{self.source.name(int(index))}: cannot be loaded: {result.reason}") from result.error
+                raise RuntimeError(f"{self.source.name(index)}: cannot be loaded: {result.reason}") from result.error
             yield result
 
 
@@ -129,35 +139,51 @@ def require_memory(sizes: Mapping[str, int], worlds: int, *, gib: float) -> None
         )
 
 
-def load(loader: BatchLoader, indices: Sequence[int] | np.ndarray, sizes: Mapping[str, int], *, on_overflow: OnOverflow) -> Batch:
-    """Loads scenes at fixed sizes. One that cannot be used is named with its reason, and its row holds another scene of the batch.
+Row = tuple[Scene | str, int]  # a scene, or why it cannot be used, and the number of axes that were cut
+
+
+def load_rows(
+    loader: BatchLoader, indices: Iterable[int | np.integer], sizes: Mapping[str, int], *, on_overflow: OnOverflow
+) -> Iterator[Row]:
+    """Loads scenes cut to fixed sizes, one after another.
 
     Raises:
-        SceneError: not one can be used, with reasons.
         ConfigError: a number that packing refuses.
         RuntimeError: another error, with the scene's name.
     """
-    rows = list(loader.each(functools.partial(_fit_scene, sizes=sizes, grid=loader.grid, on_overflow=on_overflow), indices))
+    return loader.each(functools.partial(_fit_scene, sizes=sizes, grid=loader.grid, on_overflow=on_overflow), indices)
+
+
+def stack_rows(source: SceneSource, indices: Sequence[int] | np.ndarray, rows: Sequence[Row], sizes: Mapping[str, int]) -> Batch:
+    """Stacks rows of `load_rows`. One that cannot be used is named with its reason, and its row holds another scene of the batch.
+
+    Raises:
+        SceneError: not one can be used, with reasons.
+    """
+    refused = {source.name(int(i)): scene for i, (scene, _) in zip(indices, rows, strict=True) if isinstance(scene, str)}
     usable = [number for number, (scene, _) in enumerate(rows) if not isinstance(scene, str)]
-    refused = {loader.source.name(int(i)): scene for i, (scene, _) in zip(indices, rows, strict=True) if isinstance(scene, str)}
     if not usable:
         reasons = "; ".join(f"{name}: {reason}" for name, reason in list(refused.items())[:SHOWN])
-        raise SceneError(f"{loader.source.description}: none of {len(rows)} scenes to load can be used: {reasons}")
+        raise SceneError(f"{source.description}: none of {len(rows)} scenes to load can be used: {reasons}")
     chosen = [number if number in usable else usable[number % len(usable)] for number in range(len(rows))]
-    scene = jax.tree.map(lambda *leaves: np.concatenate(leaves), *(rows[number][0] for number in chosen))
-    return Batch(scene, np.asarray(indices)[chosen], sum(rows[number][1] > 0 for number in chosen), refused)
+    scenes = [scene for number in chosen if not isinstance(scene := rows[number][0], str)]
+    stacked = pad_scenes(scenes, sizes)
+    if grids := [scene.road_grid for scene in scenes if scene.road_grid is not None]:
+        capacity = {name: sizes[name] for name in spatial_grid.SIZES}
+        stacked = unchecked(Scene, **vars(stacked) | {"road_grid": spatial_grid.stack_grids(grids, capacity)})
+    return Batch(stacked, np.asarray(indices)[chosen], sum(rows[number][1] > 0 for number in chosen), refused)
 
 
-def _fit_scene(
-    read: Callable[[], Scene], *, sizes: Mapping[str, int], grid: Mapping[str, Any], on_overflow: OnOverflow
-) -> tuple[Scene | str, int]:
-    """One scene at its fixed sizes and the number of axes that were cut; in place of one that cannot be used the reason."""
+def _fit_scene(read: Callable[[], Scene], *, sizes: Mapping[str, int], grid: Mapping[str, Any], on_overflow: OnOverflow) -> Row:
+    """One scene cut to its fixed sizes and the number of axes that were cut; in place of one that cannot be used the reason."""
     try:
-        scene, report = stack([read()], capacity={axis: sizes[axis] for axis in AXES})
+        scene, report = cut_scene(read(), {axis: sizes[axis] for axis in AXES})
         if report.cuts and on_overflow == "skip":
             return "; ".join(describe(report)[1:]), len(report.cuts)
         if grid["radius_m"] is not None:
-            scene = spatial_grid.attach_grid(scene, **grid, capacity={name: sizes[name] for name in spatial_grid.SIZES})
+            built = spatial_grid.build_grid(np.asarray(scene.road.midpoint), np.asarray(scene.road.valid), **grid, side=sizes["side"])
+            spatial_grid.require_capacity(built, sizes)
+            scene = unchecked(Scene, **vars(scene) | {"road_grid": built})
     except (SceneError, ConfigError) as error:
         return str(error), 0
     return scene, len(report.cuts)

@@ -196,6 +196,55 @@ class SceneStream:
         return placed
 
 
+class _Queue:
+    """Batches that wait for their scenes. Processes go on with the next batch while others have scenes of the one before, and while
+    another thread stacks them and places them on the devices."""
+
+    def __init__(
+        self,
+        load_rows: Callable[[Iterator[int]], Iterator[batches.Row]],
+        place: Callable[[np.ndarray, list[batches.Row]], PlacedScenes],
+        loading: ThreadPoolExecutor,
+        placing: ThreadPoolExecutor,
+    ):
+        self._load_rows, self._place, self._loading, self._placing = load_rows, place, loading, placing
+        self._waiting, self._begun = (deque[tuple[np.ndarray, Future[PlacedScenes]]]() for _ in range(2))
+
+    def add(self, indices: np.ndarray) -> Future[PlacedScenes]:
+        """The future of a batch of these entries."""
+        self._waiting.append((indices, found := Future()))
+        self._loading.submit(self._serve)
+        return found
+
+    def close(self) -> None:
+        """Lets go of the batches that nothing is loaded for yet."""
+        self._waiting.clear()
+
+    def _serve(self) -> None:
+        """Loads all that waits, and what is added meanwhile."""
+        try:
+            rows: list[batches.Row] = []
+            for row in self._load_rows(self._list_entries()):
+                rows.append(row)
+                if len(rows) == len(self._begun[0][0]):
+                    self._placing.submit(self._finish, *self._begun.popleft(), rows)
+                    rows = []
+        except BaseException as error:
+            while self._begun:
+                self._begun.popleft()[1].set_exception(error)
+
+    def _list_entries(self) -> Iterator[int]:
+        while self._waiting:
+            self._begun.append(self._waiting.popleft())
+            yield from self._begun[-1][0].tolist()
+
+    def _finish(self, indices: np.ndarray, found: Future[PlacedScenes], rows: list[batches.Row]) -> None:
+        try:
+            found.set_result(self._place(indices, rows))
+        except BaseException as error:
+            found.set_exception(error)
+
+
 def _make_state(source: SceneSource, sizes: Mapping[str, int], worlds: int, *, known: int) -> dict[str, Any]:
     """The state of a stream at its start; `known`: entries of which there are outcomes from the start on."""
     table = samplers.empty(known)
@@ -256,8 +305,9 @@ def open_stream(config: Mapping[str, Any], *, mesh: Mesh | None, before: Mapping
     if before is not None and before["source"] != source.identity:
         raise ConfigError(f"resume=true: the run streamed {_format(before['source'])}; now there are {_format(source.identity)}")
     with contextlib.ExitStack() as stack:
-        thread = ThreadPoolExecutor(1, thread_name_prefix="stream")
-        stack.callback(thread.shutdown, wait=True, cancel_futures=True)
+        threads = [ThreadPoolExecutor(1, thread_name_prefix=name) for name in ("load", "place")]
+        for thread in threads[::-1]:
+            stack.callback(thread.shutdown, wait=True, cancel_futures=True)
         task_map = stack.enter_context(open_pool(settings.workers))
         loader = BatchLoader(source, **make_packing(config["scenes"]), grid=config["scenes"]["road_grid"], task_map=task_map)
         if before is None:
@@ -269,13 +319,16 @@ def open_stream(config: Mapping[str, Any], *, mesh: Mesh | None, before: Mapping
         sizes = before["sizes"]
         batches.require_memory(sizes, worlds + settings.prefetch * swapped, gib=settings.memory_gib)
 
-        def load(indices: np.ndarray) -> PlacedScenes:
-            batch = batches.load(loader, indices, sizes, on_overflow=settings.on_overflow)
+        def place(indices: np.ndarray, rows: list[batches.Row]) -> PlacedScenes:
+            batch = batches.stack_rows(source, indices, rows, sizes)
             return PlacedScenes(batch, jax.block_until_ready(sharding.place_on_devices(batch.scene, mesh)))
 
+        load_rows = functools.partial(batches.load_rows, loader, sizes=sizes, on_overflow=settings.on_overflow)
+        queue = _Queue(load_rows, place, *threads)
+        stack.callback(queue.close)
         rows = ", ".join(f"{rows} {name}" for name, rows in sizes.items())
         LOG.info(f"stream of {source.description}: {swapped} of {worlds} worlds an iteration, each of {rows}")
-        yield SceneStream(source, settings, sampler, swapped, lambda indices: thread.submit(load, indices), before, parts)
+        yield SceneStream(source, settings, sampler, swapped, queue.add, before, parts)
 
 
 def _open(scenes: Mapping[str, Any], settings: StreamConfig) -> tuple[SceneSource, tuple[mixture.Part, ...]]:

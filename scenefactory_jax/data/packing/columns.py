@@ -4,6 +4,7 @@ The columns, their axes and dtypes follow from the annotations in `types`, so a 
 """
 
 import dataclasses
+import functools
 import types
 import typing
 from collections.abc import Iterable, Mapping
@@ -33,6 +34,7 @@ class Column(NamedTuple):
     axes: tuple[str | int, ...]
 
 
+@functools.cache
 def _read_annotation(annotation: Any, part: str) -> Column:
     """The column of an annotation such as `Float[Array, "P 2"]`."""
     dtype = next(dtype for name, dtype in DTYPES.items() if annotation.dtypes[0].startswith(name))

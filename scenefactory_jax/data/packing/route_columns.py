@@ -248,15 +248,20 @@ def _make_line(points: Float[np.ndarray, "N 2"]) -> _Line:
 
 def _project(line: _Line, point: Float[np.ndarray, "2"]) -> tuple[float, float]:
     """Arc length of the nearest place on a line, and the distance to it; (0, inf) on a line of one point."""
-    start, along, length = line
-    if not len(length):
+    if not len(line.length):
         return 0.0, np.inf
-    ahead = point - start
-    inner = ahead[:, 0] * along[:, 0] + ahead[:, 1] * along[:, 1]
-    fraction = np.minimum(np.maximum(inner / length**2, 0.0), 1.0)
-    distance = segment_lengths(start + fraction[:, None] * along - point)
+    fraction, distance = _measure(line, point)
     best = int(distance.argmin())
-    return float(length[:best].sum() + fraction[best] * length[best]), float(distance[best])
+    return float(line.length[:best].sum() + fraction[best] * line.length[best]), float(distance[best])
+
+
+def _measure(line: _Line, points: Float[np.ndarray, "*L 2"]) -> tuple[Float[np.ndarray, "*L S"], Float[np.ndarray, "*L S"]]:
+    """Where on each segment of a line the place nearest to each point is, from 0 to 1, and its distance."""
+    points = points[..., None, :]
+    ahead = points - line.start
+    inner = ahead[..., 0] * line.along[:, 0] + ahead[..., 1] * line.along[:, 1]
+    fraction = np.minimum(np.maximum(inner / line.length**2, 0.0), 1.0)
+    return fraction, segment_lengths(line.start + fraction[..., None] * line.along - points)
 
 
 def _place_agents(
@@ -277,9 +282,9 @@ def _place_agents(
 
 def _follow(line: _Line, path: Float[np.ndarray, "L 2"], arc: float) -> float:
     """Arc length at the end of a path that follows a line from `arc` on, also where the line crosses itself."""
-    for point in path:
+    for fraction, distance in zip(*_measure(line, path), strict=True):
         low = max(int(arc / ROUTE_SPACING_M) - 8, 0)
-        window = line.take(low, low + 34)
-        if len(window.length):
-            arc = ROUTE_SPACING_M * low + _project(window, point)[0]
+        if low < len(line.length):
+            best = low + int(distance[low : low + 33].argmin())
+            arc = ROUTE_SPACING_M * low + float(line.length[low:best].sum() + fraction[best] * line.length[best])
     return arc

@@ -10,7 +10,7 @@ from scipy.spatial import KDTree
 from scenefactory_jax.core import schema
 from scenefactory_jax.core.pytree import unchecked
 from scenefactory_jax.core.raw_scene import SceneError
-from scenefactory_jax.core.types import Scene
+from scenefactory_jax.core.types import Elevation, Scene
 from scenefactory_jax.data.packing import columns, elevation_grid
 
 ROUTE_AXES = ("routes", "route_points", "stops", "zones", "controls", "changes")
@@ -90,10 +90,26 @@ def stack(scenes: Sequence[Scene], *, capacity: Mapping[str, int | None]) -> tup
         sizes[axis] = round_rows(axis, max(int(axis not in MAY_BE_EMPTY), *(_count(world, axis) for world in worlds)))
     cuts: list[CutCounts] = []
     cut = [_cut(world, sizes, index, cuts) for index, world in enumerate(worlds)]
-    stacked = {name: _pad(name, [world[name] for world in cut], sizes) for name in columns.columns_of(cut[0])}
-    elevation = elevation_grid.stack_elevations([scene.elevation for scene in scenes])
-    scene = columns.assemble_columns(Scene, stacked)
-    return unchecked(Scene, **vars(scene) | {"elevation": elevation}), CutReport(len(scenes), sizes, tuple(cuts))
+    return _pad_worlds(cut, [scene.elevation for scene in scenes], sizes), CutReport(len(scenes), sizes, tuple(cuts))
+
+
+def cut_scene(scene: Scene, sizes: Mapping[str, int]) -> tuple[Scene, CutReport]:
+    """A scene with at most so many rows of each axis, as `stack` cuts it, without padding: `pad_scenes` stacks such ones."""
+    cuts: list[CutCounts] = []
+    world = _cut(_drop_padding(columns.flatten(scene)), sizes, 0, cuts)
+    cut = unchecked(Scene, **vars(columns.assemble_columns(Scene, world)) | {"elevation": scene.elevation})
+    return cut, CutReport(1, dict(sizes), tuple(cuts))
+
+
+def pad_scenes(scenes: Sequence[Scene], sizes: Mapping[str, int]) -> Scene:
+    """Stacks scenes of these sizes or smaller ones, padded with masked rows."""
+    return _pad_worlds([columns.flatten(scene) for scene in scenes], [scene.elevation for scene in scenes], sizes)
+
+
+def _pad_worlds(worlds: Sequence[Leaves], elevations: Sequence[Elevation | None], sizes: Mapping[str, int]) -> Scene:
+    stacked = {name: _pad(name, [world[name] for world in worlds], sizes) for name in columns.columns_of(worlds[0])}
+    elevation = elevation_grid.stack_elevations(elevations)
+    return unchecked(Scene, **vars(columns.assemble_columns(Scene, stacked)) | {"elevation": elevation})
 
 
 def describe(report: CutReport) -> list[str]:

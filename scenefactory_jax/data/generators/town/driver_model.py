@@ -21,6 +21,7 @@ FREE_EXPONENT = 4.0  # of the IDM
 MIN_GAP_M = 0.3  # lower bound of gaps
 MIN_SPEED_MPS = 0.5  # lower bound of desired speeds
 STANDING_MPS = 0.2
+NOWHERE_M = -1.0  # place of a road user that is not on a path: behind all that are
 SLOW_DOWN_S = 0.4  # time constant above the desired speed
 
 Column = Float[np.ndarray, " N"]  # a number of every road user
@@ -116,6 +117,7 @@ class Simulation:
         self.max_speed, self.yaw = stack_columns([path.speed for path in paths]), stack_columns([path.yaw for path in paths])
         self.projections = project_paths(paths, self.width)
         self.zones = find_zones(paths, self.projections)
+        self.projections = np.where(np.isnan(self.projections), NOWHERE_M, self.projections)
         slots = max(1, max(len(path.gates) for path in paths))
         self.gate_place, self.gate = np.full((len(paths), slots), np.inf), np.zeros((len(paths), slots), int)
         for row, path in enumerate(paths):
@@ -133,15 +135,15 @@ class Simulation:
         """Moves all road users from a time to another."""
         dt, driver, speed, present = after - now, self.driver, self.speed, self.present
         row = (self.place / STEP_M).astype(int)
-        desired = np.maximum(np.take_along_axis(self.max_speed, row[:, None], 1)[:, 0], MIN_SPEED_MPS)
-        slower = np.clip((desired - speed) / SLOW_DOWN_S, -driver.braking, 0.0)
+        desired = np.maximum(self.max_speed[np.arange(len(row)), row], MIN_SPEED_MPS)
+        slower = np.minimum(np.maximum((desired - speed) / SLOW_DOWN_S, -driver.braking), 0.0)
         free = np.where(speed > desired, slower, driver.acceleration * (1 - (speed / desired) ** FREE_EXPONENT))
         gap, leader_speed = self._find_leaders(row)
         brake = driver.brake_before(speed[:, None], gap, leader_speed, driver.gap_m).max(axis=1)
         line = self._find_closed_line(gates, dt)
         brake = np.maximum(brake, driver.brake_before(speed, line, 0.0, MIN_GAP_M))
         brake = np.maximum(brake, self._give_way(desired, line))
-        acceleration = np.clip(free - brake, -driver.max_braking, driver.acceleration)
+        acceleration = np.minimum(np.maximum(free - brake, -driver.max_braking), driver.acceleration)
         new_speed = np.maximum(speed + acceleration * dt, 0.0)
         has_room = gap.min(axis=1) > driver.gap_m + speed * driver.headway_s
         self.place = np.minimum(np.where(present, self.place + (speed + new_speed) / 2 * dt, self.place), self.path_length)
@@ -152,7 +154,8 @@ class Simulation:
         """Computes the distance to the nearest closed stop line, inf: none; counts the standing time at signs."""
         driver = self.driver
         state = gates[self.gate] if gates.size else np.zeros(self.gate.shape, int)
-        state = np.where((state == CLOSED) & self.turns, SIGN, np.where(np.isin(state, (CLOSED, CLOSING)) & self.runs, OPEN, state))
+        stops = state == CLOSED
+        state = np.where(stops & self.turns, SIGN, np.where((stops | (state == CLOSING)) & self.runs, OPEN, state))
         line = self.gate_place - (self.place + self.length / 2)[:, None] - driver.line_gap_m
         standing = (self.speed < STANDING_MPS)[:, None] & (line < 2.0) & (line > -driver.line_gap_m)
         self.waited = self.waited + dt * (standing & (state == SIGN))
@@ -165,9 +168,9 @@ class Simulation:
         count, place = np.arange(len(self.place)), self.place
         at = (place / ROW_M).astype(int)
         projected = self.projections[count, :, at].T  # [i, j]: place of j on the path of i
-        is_ahead = np.isfinite(projected) & self.present[None, :] & (projected > place[:, None] + 0.05)
-        index = np.clip(np.nan_to_num(projected) / STEP_M, 0, self.yaw.shape[1] - 1).astype(int)
-        turn = self.yaw[count, row][None, :] - np.take_along_axis(self.yaw, index, 1)
+        is_ahead = self.present & (projected > place[:, None] + 0.05)
+        index = np.minimum(np.maximum(projected / STEP_M, 0), self.yaw.shape[1] - 1).astype(int)
+        turn = self.yaw[count, row] - self.yaw[count[:, None], index]
         cos, sin = np.cos(turn), np.abs(np.sin(turn))
         half_extent = (np.abs(cos) * self.length + sin * self.width) / 2
         past_row = (place - at * ROW_M)[None, :] * cos
@@ -191,8 +194,8 @@ class Simulation:
         stopped = line[second] < second_distance  # the second waits for a light or a sign before the zone
         through = distance + (zones.end[rows] - zones.start[rows]) + length[first]
         second_through = zones.second_end[rows] - rear[second]
-        ways = ((first, distance), (first, through), (second, second_distance), (second, second_through))
-        arrive, clear, second_arrive, second_clear = (driver.arrival_time(way, speed[user], desired[user]) for user, way in ways)
+        user, way = np.stack([first, first, second, second]), np.stack([distance, through, second_distance, second_through])
+        arrive, clear, second_arrive, second_clear = driver.arrival_time(way, speed[user], desired[user])
 
         cannot_stop = second_distance < speed[second] ** 2 / (2 * driver.braking)
         second_is_first = (second_arrive < arrive) | ((second_arrive == arrive) & (second < first))

@@ -31,8 +31,9 @@ def draw_driveways(
     turns = KDTree(np.concatenate(turns)) if turns else None
     places, normals = [arc_length(kerb) for kerb in kerbs], [right_normals(kerb) for kerb in kerbs]
     lengths = np.array([place[-1] for place in places])
+    weights = lengths / lengths.sum()
     for _ in range(int(rng.integers(*count, endpoint=True)) if kerbs else 0):
-        chosen = int(rng.choice(len(kerbs), p=lengths / lengths.sum()))
+        chosen = int(rng.choice(len(kerbs), p=weights))
         kerb, place = kerbs[chosen], places[chosen]
         width, depth, at = rng.uniform(*width_m), rng.uniform(*depth_m), rng.uniform(0.0, place[-1])
         if width > min(at, place[-1] - at):
@@ -45,9 +46,11 @@ def draw_driveways(
         middle = entry + CAR_M * out
         if turns is not None and turns.query(entry)[0] < junction_m:
             continue
-        taken = any(np.linalg.norm(middle - spot) < MIN_SPACING_M for spot, _ in spots)
-        ground = shapely.Polygon(outline + 0.2 * out), shapely.Point(middle).buffer(CLEARANCE_M)
-        if not taken and not any(area.intersects(surface) for area in ground):
-            outlines.append(np.concatenate([outline, outline[:1]]))
-            spots.append((middle, float(np.arctan2(out[1], out[0])) + np.pi * float(rng.integers(2))))
+        if any(np.linalg.norm(middle - spot) < MIN_SPACING_M for spot, _ in spots):
+            continue
+        ground = (shapely.Polygon(outline + 0.2 * out), shapely.Point(middle).buffer(CLEARANCE_M))
+        if shapely.intersects(surface, ground).any():
+            continue
+        outlines.append(np.concatenate([outline, outline[:1]]))
+        spots.append((middle, float(np.arctan2(out[1], out[0])) + np.pi * float(rng.integers(2))))
     return outlines, spots

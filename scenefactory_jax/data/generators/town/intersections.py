@@ -114,8 +114,8 @@ def intersection(
     turns = find_turns(arms)
     for _ in range(MAX_GROWTHS):
         arms = [arm._replace(centre=centre, distance=float(distance)) for arm, distance in zip(arms, distances, strict=True)]
-        paths = [_turn_path(arms, turn) for turn in turns]
-        if max(np.abs(curvature(path)[2:-2]).max() for path in paths) <= 1 / turn_radius_m:
+        paths = _build_turns(arms, turns, 1 / turn_radius_m)
+        if paths is not None:
             break
         distances = distances + GROWTH_M
     else:
@@ -162,6 +162,16 @@ def _compute_distances(arms: Sequence[Arm], corner: float) -> Float[np.ndarray, 
             distances[i] = max(distances[i], (right + left * np.cos(between)) / np.sin(between) + rounding)
             distances[j] = max(distances[j], (left + right * np.cos(between)) / np.sin(between) + rounding)
     return distances
+
+
+def _build_turns(arms: Sequence[Arm], turns: Sequence[Turn], max_curvature: float) -> list[Points] | None:
+    """Computes the centre lines of connecting lanes; None if one of them bends more sharply."""
+    paths = []
+    for turn in turns:
+        paths.append(path := _turn_path(arms, turn))
+        if np.abs(curvature(path)[2:-2]).max() > max_curvature:
+            return None
+    return paths
 
 
 def _turn_path(arms: Sequence[Arm], turn: Turn) -> Points:

@@ -33,6 +33,7 @@ def boundary(
     open_ends = shapely.union_all(network.open_ends)
     outer, inner = ([piece for ring in group for piece in _cut_ring(ring, reach, spacing_m, open_ends)] for group in (rings, island_rings))
     surface = shapely.difference(shapely.MultiPolygon(solid), shapely.union_all(network.islands))
+    shapely.prepare(surface)  # it is asked about many points
     return outer, inner, surface
 
 

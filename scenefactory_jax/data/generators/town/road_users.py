@@ -84,6 +84,7 @@ def draw_cars(
     lengths = np.array([arc_length(network.lanes[i].points)[-1] for i in usable])
     densities = [1.0 if network.lanes[i].limit > PARKING_LOT_MPS else driving.parking_lot_fraction for i in usable]
     weights = lengths * np.array(densities, float)
+    weights /= weights.sum()
     inlets = [i for i in usable if not network.entries[i] and network.exits[i] and np.abs(network.lanes[i].points[0]).max() < 2 * reach]
     cars: list[SimulatedUser] = []
     places: list[np.ndarray] = []
@@ -93,7 +94,7 @@ def draw_cars(
             break
         size = driving.draw_size(rng)
         later = bool(cars and inlets) and rng.random() < driving.arriving_fraction
-        index = int(rng.choice(inlets)) if later else usable[int(rng.choice(len(usable), p=weights / weights.sum()))]
+        index = int(rng.choice(inlets)) if later else usable[int(rng.choice(len(usable), p=weights))]
         lane = network.lanes[index]
         row = round(size[0] / 2 / FINE_M) + 2 if later else int(rng.integers(len(lane.points)))
         if driving.platoon_fraction > 0 and starts and not later and rng.random() < driving.platoon_fraction:
@@ -103,7 +104,7 @@ def draw_cars(
         gap = driving.start_gap_m + size[0] / 2
         expected = _predict_place(rng, lane, row, times) if lane.kind == LANE_FREEWAY else place
         max_distance = reach if cars else driving.max_first_start_m
-        if not later and (np.abs(expected).max() > max_distance or any(np.hypot(*(place - other)) < gap for other in places)):
+        if not later and (np.abs(expected).max() > max_distance or (places and (np.hypot(*(place - np.array(places)).T) < gap).any())):
             continue
         path = _draw_drive(rng, network, index, row, times, driving)
         if path is None:
