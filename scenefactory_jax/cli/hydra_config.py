@@ -110,6 +110,8 @@ def _open(name: str, overrides: Sequence[str], *, whole: bool = False) -> Any:
         ConfigError: see `load_config`.
     """
     find_config(name)
+    if wrong := [override for override in overrides if not isinstance(override, str)]:
+        raise ConfigError(f"overrides: expected texts, as in load_config('train', 'worlds=8', 'seed=1'), got {wrong[0]!r}")
     try:
         opened = _compose(name, overrides, whole=whole)
         if not whole:
@@ -199,6 +201,8 @@ def apply_overrides(config: Mapping[str, Any], overrides: Sequence[str]) -> dict
     Raises:
         ConfigError: no such group, option or key in the run's config, with the valid ones.
     """
+    if isinstance(overrides, str):
+        raise ConfigError(f"overrides: expected a list, as ['worlds=8'], got {overrides!r}")
     result = copy.deepcopy(dict(config))
     for override in overrides:
         path, separator, value = override.partition("=")
