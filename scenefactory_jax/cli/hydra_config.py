@@ -110,8 +110,6 @@ def _open(name: str, overrides: Sequence[str], *, whole: bool = False) -> Any:
         ConfigError: see `load_config`.
     """
     find_config(name)
-    if wrong := [override for override in overrides if not isinstance(override, str)]:
-        raise ConfigError(f"overrides: expected texts, as in load_config('train', 'worlds=8', 'seed=1'), got {wrong[0]!r}")
     try:
         opened = _compose(name, overrides, whole=whole)
         if not whole:
