@@ -195,6 +195,8 @@ def apply_overrides(config: Mapping[str, Any], overrides: Sequence[str]) -> dict
     Raises:
         ConfigError: no such group, option or key in the run's config, with the valid ones.
     """
+    if isinstance(overrides, str):
+        raise ConfigError(f"overrides: expected a list, as ['worlds=8'], got {overrides!r}")
     result = copy.deepcopy(dict(config))
     for override in overrides:
         path, separator, value = override.partition("=")

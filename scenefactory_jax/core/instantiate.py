@@ -30,7 +30,8 @@ def instantiate(entry: Mapping[str, Any], *, builtins: types.ModuleType | str, w
         ConfigError: no or unknown target, an unknown or missing key, a value of the wrong type.
     """
     if not isinstance(entry, Mapping) or "_target_" not in entry:
-        raise ConfigError(f"{where}: expected a mapping with `_target_` and its numbers, got {entry!r}")
+        hint = f"; if the option in use has no such entry, ~{where} takes it out" if isinstance(entry, Mapping) and "." in where else ""
+        raise ConfigError(f"{where}: expected a mapping with `_target_` and its numbers, got {entry!r}{hint}")
     function = resolve_target(entry["_target_"], builtins=builtins, where=where)
     parameters = {p.name: p for p in inspect.signature(function).parameters.values() if p.kind is p.KEYWORD_ONLY}
     numbers = {key: value for key, value in entry.items() if key != "_target_"}

@@ -20,6 +20,8 @@ from jaxtyping import Array
 from scenefactory_jax.core import distributed, sharding
 from scenefactory_jax.core.atomic_file import write_atomically
 from scenefactory_jax.core.schema import ConfigError
+from scenefactory_jax.learning import replay_buffer
+from scenefactory_jax.learning.replay_buffer import Buffer
 
 PARAMETERS, AVERAGED, LEARNT, BUFFER = "parameters/", "ema_parameters/", "learner/", "buffer/"  # paths of arrays begin with these
 NETWORK = "/params/"  # behind the path of a network
@@ -79,6 +81,8 @@ def drop_training_state(folder: Path | str) -> None:
 def restore(folder: Path | str, like: Any, iteration: int | None = None) -> Any:
     """Reads the train state of an iteration (the newest by default), in the structure and on the devices of `like`.
 
+    Replay buffers may have other groups, of another number of devices: their rows are dealt anew.
+
     Args:
         like: a train state of the same config, for example a new `trainer.init(...)`.
 
@@ -90,15 +94,35 @@ def restore(folder: Path | str, like: Any, iteration: int | None = None) -> Any:
     stored = {name: value for name, value in _load(file).items() if name != HOST}
     if all(name.startswith((PARAMETERS, AVERAGED)) for name in stored):
         raise ConfigError(f"{file}: has parameters only; training cannot go on from it")
-    leaves, buffers = name_leaves(like), _buffer_path(file)
+    leaves = name_leaves(like)
+    stored |= _load_buffers(file, like, missing=not any(name.startswith(BUFFER) for name in stored))
+    stored |= _regroup_buffers(stored, like)
+    _check_same_arrays(stored, {name: _to_data(leaf) for name, leaf in leaves.items() if leaf.size}, file)
+    return jax.tree.unflatten(jax.tree.structure(like), [_place(stored.get(name), leaf) for name, leaf in leaves.items()])
+
+
+def _load_buffers(file: Path, like: Any, *, missing: bool) -> Arrays:
+    """The replay buffers of a checkpoint; `missing`: it has none itself, as those that were made before buffers had their own file."""
+    buffers = _buffer_path(file)
     if buffers.is_file():
         if damage := _find_damage(buffers):
             raise ConfigError(f"{buffers}: damaged: {damage}; restore it from a copy, or start_from this run")
-        stored |= _load(buffers)
-    elif any(name.startswith(BUFFER) for name in leaves) and not any(name.startswith(BUFFER) for name in stored):
+        return _load(buffers)
+    if missing and jax.tree.leaves(like.buffer):
         raise ConfigError(f"{file}: {buffers.name} is not beside it, the replay buffer; training cannot go on, only start_from this run")
-    _check_same_arrays(stored, {name: _to_data(leaf) for name, leaf in leaves.items() if leaf.size}, file)
-    return jax.tree.unflatten(jax.tree.structure(like), [_place(stored.get(name), leaf) for name, leaf in leaves.items()])
+    return {}
+
+
+def _regroup_buffers(stored: Arrays, like: Any) -> Arrays:
+    """Deals the rows of replay buffers to as many groups as `like` has, which may be of another number of devices."""
+    regrouped: Arrays = {}
+    for name, buffer in like.buffer.items() if isinstance(like.buffer, Mapping) else ():
+        prefix = f"{BUFFER}{name}/"
+        found = {path.removeprefix(prefix): leaf for path, leaf in stored.items() if path.startswith(prefix)}
+        if isinstance(buffer, Buffer) and "filled" in found and len(found["filled"]) != len(buffer.filled):
+            groups, capacity = jax.tree.leaves(buffer.rows)[0].shape[:2]
+            regrouped |= {f"{prefix}{path}": leaf for path, leaf in replay_buffer.regroup(found, groups, capacity).items()}
+    return regrouped
 
 
 def restore_host(folder: Path | str, iteration: int | None = None) -> dict[str, Any] | None:

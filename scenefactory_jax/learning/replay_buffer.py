@@ -10,6 +10,7 @@ The next observation is stored with each transition: a slot's next row is not at
 """
 
 import os
+from collections.abc import Mapping
 from typing import Any, Literal
 
 import jax
@@ -86,6 +87,31 @@ def sample(buffer: Buffer, key: PRNGKeyArray, size: int, *, axis: str | None) ->
 def count_rows(buffer: Buffer, *, axis: str | None) -> Int[Array, ""]:
     """Counts the rows of all devices."""
     return sharding.sum_over_devices(jnp.sum(buffer.filled), axis)
+
+
+def regroup(stored: Mapping[str, np.ndarray], groups: int, capacity: int) -> dict[str, np.ndarray]:
+    """Deals the rows of a stored buffer to another number of groups, on the host; the oldest are left out where they do not fit.
+
+    Args:
+        stored: the buffer's arrays by their paths, `position`, `filled` and the rows [G, N, ...].
+        groups, capacity: numbers of the new groups and of the rows of each.
+    """
+    position, filled = stored["position"], stored["filled"]
+    size = next(leaf.shape[1] for leaf in stored.values() if leaf.ndim > 1)
+    age = np.concatenate([np.arange(count) for count in filled])  # 0: a group's newest row
+    group = np.repeat(np.arange(len(filled)), filled)
+    newest_first = np.lexsort((group, age))[: groups * capacity]
+    group, row = group[newest_first], (position[group] - 1 - age)[newest_first] % size
+    counts = np.bincount(np.arange(len(row)) % groups, minlength=groups).astype(np.int32)
+    now = np.arange(len(row)) % groups, counts[np.arange(len(row)) % groups] - 1 - np.arange(len(row)) // groups
+
+    def deal(leaf: np.ndarray) -> np.ndarray:
+        made = np.zeros((groups, capacity, *leaf.shape[2:]), leaf.dtype)
+        made[now] = leaf[group, row]
+        return made
+
+    rows = {name: deal(leaf) for name, leaf in stored.items() if name not in ("position", "filled")}
+    return {**rows, "position": counts % np.int32(capacity), "filled": counts}
 
 
 def compress(observation: Observation, storage: Storage) -> Observation:

@@ -24,6 +24,11 @@ HERE = ["progress=false", "spread.timeout_s=null"]  # of a conversion in this pr
 COMMANDS = {"train": train, "benchmark": benchmark, "view": view, "scenes": scenes, "convert": convert, "evaluate": evaluate}
 
 
+def test_overrides_of_a_run_are_a_list():
+    with pytest.raises(ConfigError, match=r"overrides: expected a list, .* got 'worlds=3'"):
+        hydra_config.apply_overrides({"worlds": 2}, "worlds=3")
+
+
 def refused(command, *overrides):
     """The message with which a command refuses a config; a run must not even begin a folder."""
     with pytest.raises((ConfigError, SceneError)) as caught:

@@ -45,6 +45,12 @@ def test_entries_that_do_not_fit_are_named(change, message):
         instantiate({**ENTRY, **change}, builtins=_module(), where="x")
 
 
+def test_an_entry_that_the_chosen_option_lacks_is_told_how_to_leave():
+    """`experiment=demo observations=vmax_road`: the experiment counts rows of a group that these observations do not have."""
+    with pytest.raises(ConfigError, match=r"observations.road: .* got \{'count': 48\}; .* ~observations.road takes it out"):
+        instantiate({"count": 48}, builtins=_module(), where="observations.road")
+
+
 IMPORTED = ["build", "scenefactory_jax.env.rewards.build", "scenefactory_jax.env.rewards.Mapping", "event.func", ".event", ""]
 
 

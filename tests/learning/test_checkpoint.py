@@ -12,7 +12,7 @@ from flax import traverse_util
 from support.probes import SMALL, make_trainer, probe, scenes
 
 from scenefactory_jax.core.instantiate import ConfigError
-from scenefactory_jax.learning import checkpoint
+from scenefactory_jax.learning import checkpoint, replay_buffer
 from scenefactory_jax.learning.networks import late_fusion
 from scenefactory_jax.learning.trainer import get_policy_parameters
 
@@ -112,6 +112,18 @@ def test_a_run_without_a_mean_is_saved_and_restored(saved, tmp_path):
     assert_same(checkpoint.restore_parameters(tmp_path), third.parameters)
     with pytest.raises(ConfigError, match=r"ema_parameters/params/actor/.*: it has .* float32, the config expects none"):
         checkpoint.restore(folder, alone)
+
+
+def test_a_buffer_goes_on_in_the_groups_of_other_devices(saved, tmp_path):
+    _, third, _ = saved
+    two = replay_buffer.Buffer({"action": jnp.arange(8.0).reshape(2, 4)}, jnp.array([1, 2]), jnp.array([4, 2]))
+    one = replay_buffer.make_empty({"action": jax.ShapeDtypeStruct((), jnp.float32)}, groups=1, capacity=8)
+    checkpoint.save(tmp_path, dataclasses.replace(third, buffer={"sac": two}), keep=1)
+    restored = checkpoint.restore(tmp_path, dataclasses.replace(third, buffer={"sac": one}))
+    rows = restored.buffer["sac"]
+    assert rows.rows["action"].tolist() == [[1.0, 2.0, 4.0, 3.0, 5.0, 0.0, 0.0, 0.0]]
+    assert rows.filled.tolist() == rows.position.tolist() == [6]
+    assert_same(dataclasses.replace(restored, buffer=()), third)
 
 
 def test_an_incomplete_checkpoint_is_ignored(saved):

@@ -60,6 +60,23 @@ def test_no_masked_row_is_ever_drawn(filled):
     assert not filled[1][0].filled[1] and filled[1][0].filled[0]
 
 
+@pytest.mark.parametrize(("groups", "capacity"), [(1, 40), (3, 13), (4, 10), (2, 7)])
+def test_rows_are_dealt_to_other_groups_the_oldest_first(filled, groups, capacity):
+    """Nothing is lost that has room, and what is written next takes the place of the oldest rows."""
+    for buffer, _, stored in filled[1:]:
+        arrays = {"number": buffer.rows["number"], "set": buffer.rows["set"], "position": buffer.position, "filled": buffer.filled}
+        dealt = replay_buffer.regroup(jax.device_get(arrays), groups, capacity)
+        kept, count = dealt["number"], dealt["filled"]
+        assert kept.shape == (groups, capacity) and count.sum() == min(sum(map(len, stored)), groups * capacity) and np.ptp(count) <= 1
+        found = np.concatenate([row[:number] for row, number in zip(kept, count, strict=True)]).tolist()
+        age = {value: index for rows in stored for index, value in enumerate(reversed(rows))}
+        assert sorted(age[value] for value in found) == sorted(age.values())[: len(found)]
+        np.testing.assert_array_equal(dealt["set"][..., 0][kept != 0], kept[kept != 0])
+        for row, number, position in zip(kept, count, dealt["position"], strict=True):
+            ages = [age[value] for value in row[:number].tolist()]
+            assert ages == sorted(ages, reverse=True) and position == number % capacity
+
+
 def test_observations_are_stored_in_few_bits_and_within_their_range():
     observation = {"ego": jnp.array([[0.1, 1e6, -1e6]]), "road": SetObservation(jnp.ones((1, 2, 3)), jnp.array([[True, False]]))}
     kept = replay_buffer.compress(observation, "float16")
