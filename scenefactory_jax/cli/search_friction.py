@@ -13,7 +13,7 @@ from scenefactory_jax.core import column_table, schema
 from scenefactory_jax.core import config as run_config
 from scenefactory_jax.core.instantiate import ConfigError
 from scenefactory_jax.core.raw_scene import RawScene
-from scenefactory_jax.core.schema import Count, NonNegative, Seed
+from scenefactory_jax.core.schema import NonNegative, Seed
 from scenefactory_jax.data.bank import bank_reader as banks
 from scenefactory_jax.data.loading import scene_source
 from scenefactory_jax.data.packing import road_patches
@@ -41,7 +41,7 @@ class SearchFriction:
     seed: Seed
     ttc_limit_s: NonNegative
     search: SearchSettings
-    pictures: Count
+    pictures: Seed
     protocol: Protocol
     failures: Failures
 

@@ -5,11 +5,13 @@ resample draws seeds with replacement, scenes with replacement (the same for all
 (the same for all seeds). The interval of one run measures how well one set of weights is known, that of several how well their recipe is.
 """
 
+import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import NamedTuple, TypeVar
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
+from scipy import stats
 
 from scenefactory_jax.evaluation.metrics.agent_metrics import METRICS
 from scenefactory_jax.evaluation.metrics.metric import Metric
@@ -100,7 +102,11 @@ def difference(before: Records, after: Records, *, bootstrap: int, seed: int) ->
 
 
 def difference_of_runs(before: Runs, after: Runs, *, bootstrap: int, seed: int) -> dict[str, Estimate]:
-    """As `difference`, over several runs: each resample draws scenes and agents once for both, and seeds too if both have the same."""
+    """As `difference`, over several runs: each resample draws scenes and agents once for both, and seeds too if both have the same.
+
+    `p` is not below that of a t-test over the seeds: a bootstrap takes the few that there are for all, and three agree by chance in a
+    quarter of all cases.
+    """
     return _difference(before, after, agents=True, bootstrap=bootstrap, seed=seed)
 
 
@@ -142,6 +148,16 @@ def compute_p(draws: Float[np.ndarray, " B"]) -> float:
     return float(min(1.0, 2.0 * (1 + beyond) / (len(finite) + 1)))
 
 
+def compute_seed_p(old: Float[np.ndarray, "S M"], new: Float[np.ndarray, "R M"], *, paired: bool) -> Float[np.ndarray, " M"]:
+    """Computes the two-sided probability of a difference of the means over seeds (Student's t-test of pairs, or Welch's); 0 where a single
+    seed, or seeds that do not vary, cannot tell."""
+    if min(len(old), len(new)) < 2:
+        return np.zeros(old.shape[1])
+    with warnings.catch_warnings(action="ignore"):  # of seeds that do not vary
+        test = stats.ttest_rel(new, old) if paired else stats.ttest_ind(new, old, equal_var=False)
+    return np.nan_to_num(np.asarray(test[1]))
+
+
 def adjust_holm(probabilities: Mapping[Key, float]) -> dict[Key, float]:
     """Adjusts probabilities for that many comparisons: one below 0.05 is a finding at 5 % for all of them together (Holm 1979)."""
     adjusted, largest = {}, 0.0
@@ -173,7 +189,7 @@ def _difference(before: Runs, after: Runs, *, agents: bool, bootstrap: int, seed
     first, second = tables = _tabulate([before, after])
     sizes = [len(before)] if list(before) == list(after) else [len(before), len(after)]
     old, new = (_ratios(table, *_ones(table))[0] for table in tables)
-    draws = []
+    p_of_seeds, draws = compute_seed_p(*map(_compute_each_seed, tables), paired=len(sizes) == 1), []
     for *seeds, scene, agent in _resample(first, sizes, agents=agents, bootstrap=bootstrap, seed=seed):
         draws.append(_ratios(second, seeds[-1], scene, agent) - _ratios(first, seeds[0], scene, agent))
     draws, estimates = np.concatenate(draws), {}
@@ -185,7 +201,8 @@ def _difference(before: Runs, after: Runs, *, agents: bool, bootstrap: int, seed
         rates = [(float(rate[m]), _count_agents(table, m)) for rate, table in zip((old, new), tables, strict=True)]
         score = lambda rates=rates: newcombe(*rates)  # noqa: E731
         estimate = _make_estimate(metric, new[m] - old[m], count, interval, agents, NEWCOMBE, score)
-        estimates[name] = estimate._replace(p=compute_p(draws[:, m]) if estimate.method in (LEVELS, SCENES) else None)
+        p = max(compute_p(draws[:, m]), float(p_of_seeds[m])) if estimate.method in (LEVELS, SCENES) else None
+        estimates[name] = estimate._replace(p=p)
     return _without_uncounted(estimates)
 
 
@@ -271,6 +288,12 @@ def _values(metric: Metric, records: Records) -> tuple[np.ndarray, np.ndarray]:
 def _ones(table: Table) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Weights of the sample itself: each seed, scene and agent once."""
     return np.ones((1, len(table.sums))), np.ones((1, table.scene.max() + 1)), np.ones((1, len(table.scene)))
+
+
+def _compute_each_seed(table: Table) -> Float[np.ndarray, "S M"]:
+    """The value of each metric for each seed; NaN where no agent counts."""
+    seeds = len(table.sums)
+    return _ratios(table, np.eye(seeds), *(np.repeat(ones, seeds, axis=0) for ones in _ones(table)[1:]))
 
 
 def _resample(table: Table, seeds: Sequence[int], *, agents: bool, bootstrap: int, seed: int) -> Iterator[tuple[np.ndarray, ...]]:

@@ -130,6 +130,19 @@ def test_the_smallest_probability_is_that_of_the_number_of_resamples():
     assert change.p == pytest.approx(2 / 1000)
 
 
+def test_a_difference_of_few_seeds_is_as_probable_as_a_t_test_of_them_says():
+    """Three seeds that all gain, each as much in every scene: all resamples gain, but the gains differ too much."""
+    rates = np.array([[0.2, 0.2, 0.3], [0.4, 0.9, 0.5]])
+    runs = [{seed: records(np.arange(10)[None].repeat(12, axis=0) < 10 * rate) for seed, rate in enumerate(row)} for row in rates]
+    found = statistics.difference_of_runs(*runs, bootstrap=400, seed=0)["success_rate"]
+    assert found.low > 0 and found.p == pytest.approx(stats.ttest_rel(rates[1], rates[0]).pvalue) and found.p > 0.05
+    other = {seed + 7: run for seed, run in runs[1].items()}
+    unpaired = statistics.difference_of_runs(runs[0], other, bootstrap=400, seed=0)["success_rate"].p
+    assert unpaired == pytest.approx(stats.ttest_ind(*rates, equal_var=False).pvalue)
+    one = statistics.difference_of_runs({0: runs[0][1]}, {0: runs[1][1]}, bootstrap=400, seed=0)["success_rate"]
+    assert one.p == pytest.approx(2 / 401)  # of one seed scenes and agents alone tell
+
+
 def test_holms_correction():
     """By hand: sorted, the smallest times 4, the next times 3 and so on, never below the one before, at most 1."""
     found = statistics.adjust_holm({"a": 0.01, "b": 0.04, "c": 0.03, "d": 0.5})

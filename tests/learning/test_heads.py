@@ -176,6 +176,8 @@ def test_mistakes_are_named():
     entry = {"_target_": "lq", **ENTRIES["lq"]}
     with pytest.raises(ConfigError, match=r"policy\.mean_init: expected 3 numbers"):
         actor_critic.make(encoder=entry, **{**POLICY, "mean_init": [0.0]})
+    with pytest.raises(ConfigError, match=r"policy\.shared_encoder: expected false for the actor tanh_gaussian"):
+        actor_critic.make(encoder=entry, **{**POLICY, "shared_encoder": True}, actor="tanh_gaussian")
     with pytest.raises(ConfigError, match=r"policy\.activation: expected one of elu, relu, tanh, got 'gelu'"):
         heads.make_actor(encoding.make_encoder("lq"), 4, hidden=[4], activation="gelu")
     with pytest.raises(ConfigError, match=r"policy\.encoder\.latents: expected an integer >= 1, got 0"):

@@ -47,6 +47,8 @@ def make(
     bound = make_encoder(encoder, observations=observation_groups, dtype=dtype)
     first = {"mean_init": tuple(map(float, mean_init)), "log_std_init": float(log_std_init), "actor_head_scale": float(actor_head_scale)}
     if actor != "gaussian":
+        if shared_encoder:
+            raise ConfigError(f"policy.shared_encoder: expected false for the actor {actor}, whose critics share no encoder, got true")
         head = {"hidden": hidden, "activation": activation, "dtype": dtype, "activate_last": False}
         return squashed.make(bound, actor=actor, numbers=numbers, **head, **first)
     network = ActorCritic(bound, tuple(hidden), activation, shared_encoder, **first, dtype=dtype, values=values)
