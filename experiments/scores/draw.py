@@ -10,7 +10,7 @@ import numpy as np
 from matplotlib import pyplot as plt
 from matplotlib.patches import Polygon
 
-from scenefactory_jax.core.boxes import compute_corners
+from scenefactory_jax.core.boxes import compute_corners, find_overlaps
 from scenefactory_jax.core.types import LANE_STREET
 from scenefactory_jax.env import planning_metrics
 from scenefactory_jax.evaluation.metrics import nuplan_steps, vmax_steps, waymax_steps
@@ -121,7 +121,7 @@ def draw_encroachment(axes: plt.Axes) -> None:
     apart = np.inf
     for row, place in enumerate(own):
         boxes = (jnp.asarray(other, jnp.float32), jnp.full(len(time), -np.pi / 2), jnp.tile(SIZE, (len(time), 1)))
-        hit = np.asarray(waymax_steps.find_overlaps(jnp.asarray(place, jnp.float32), jnp.float32(0), SIZE, *boxes))
+        hit = np.asarray(find_overlaps(jnp.asarray(place, jnp.float32), jnp.float32(0), SIZE, *boxes))
         apart = min([apart, *(dt * abs(np.flatnonzero(hit) - row))])
     for row in range(0, 41, 8):
         draw_car(axes, *own[row], alpha=0.35)

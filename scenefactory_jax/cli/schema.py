@@ -92,28 +92,34 @@ class Evaluate(Episodes):
 
 
 @dataclass(frozen=True)
-class Train(Task):
-    """The command `train`."""
+class Learning(Task):
+    """A task, and how a policy learns in it."""
 
     name: str
     out: str | None
     resume: bool
-    start_from: str | None
     seed: Seed
     worlds: Count
     devices: Count | None
-    distributed: Distributed
-    iterations: Count
-    minutes: NonNegative | None
-    checkpoint_every: Count
-    checkpoints_kept: Count
-    progress: bool
     loggers: Group
     scenes: Group
     policy: Group
     learner: Group
     ppo: Group
     stream: Group | None
+
+
+@dataclass(frozen=True)
+class Train(Learning):
+    """The command `train`."""
+
+    start_from: str | None
+    distributed: Distributed
+    iterations: Count
+    minutes: NonNegative | None
+    checkpoint_every: Count
+    checkpoints_kept: Count
+    progress: bool
     evaluation: TrainEvaluation
 
 
@@ -182,26 +188,14 @@ class Baseline:
 
 
 @dataclass(frozen=True)
-class Benchmark(Task):
+class Benchmark(Learning):
     """The command `benchmark`; `iterations`, `minutes` and `evaluation` are not read, so that experiments apply."""
 
-    name: str
-    seed: Seed
-    worlds: Count
-    devices: Count | None
     warmup: Seed
     repeats: Count
     scope: Literal["training", "environment", "physics"]
     phases: bool
     variants: dict[str, dict[str, Any]]
-    out: str | None
-    resume: bool
-    loggers: Group
-    scenes: Group
-    policy: Group
-    learner: Group
-    ppo: Group
-    stream: Group | None
     baseline: Baseline | None
     iterations: Any
     minutes: Any

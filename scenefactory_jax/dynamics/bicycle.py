@@ -178,14 +178,19 @@ def read(body: Body, *, height: float) -> Motion:
     flat = body.speed[:, None] * heading_vector(body.yaw + body.slip_angle)
     if body.ground is not None:
         flat = flat * compute_grade(body.ground, body.yaw)[1][:, None]
-    zero = jnp.zeros_like(body.speed)
+    return make_motion(body, flat, body.steer, height=height)
+
+
+def make_motion(body: Any, velocity: Float[Array, "A 2"], steer: Float[Array, " A"], *, height: float) -> Motion:
+    """Makes the motion of upright cars without tyres, lifted onto the road."""
+    zero = jnp.zeros_like(body.yaw)
     motion = Motion(
         position=jnp.concatenate([body.position, jnp.full_like(zero, height)[:, None]], axis=-1),
-        velocity=jnp.concatenate([flat, zero[:, None]], axis=-1),
+        velocity=jnp.concatenate([velocity, zero[:, None]], axis=-1),
         yaw=body.yaw,
         yaw_rate=body.yaw_rate,
         upright=jnp.ones_like(zero),
-        steer=body.steer,
+        steer=steer,
         contact_force=body.contact_force,
         mu=body.mu,
         friction_utilization=body.friction_utilization,

@@ -17,8 +17,9 @@ from scenefactory_jax.core.pytree import pytree_dataclass, replace, tree_where
 from scenefactory_jax.core.schema import NonNegative, Positive
 from scenefactory_jax.core.types import Dynamics, Motion, Scene
 from scenefactory_jax.dynamics.articulated.parameters import GRAVITY
+from scenefactory_jax.dynamics.bicycle import make_motion
 from scenefactory_jax.dynamics.collision import REPORT_S, collect_boxes, make_contact, report_forces
-from scenefactory_jax.roadgraph.elevation import LEVEL_M, Ground, find_ground, find_start_ground, lift_motion
+from scenefactory_jax.roadgraph.elevation import LEVEL_M, Ground, find_ground, find_start_ground
 
 STANDING_MPS = 0.6  # slower, the direction of the velocity says nothing about the heading
 
@@ -129,17 +130,4 @@ def compute_inverse_action(
 
 def read(body: Body, *, height: float, wheelbase: float) -> Motion:
     """Reads the motion of the cars."""
-    zero = jnp.zeros_like(body.yaw)
-    motion = Motion(
-        position=jnp.concatenate([body.position, jnp.full_like(zero, height)[:, None]], axis=-1),
-        velocity=jnp.concatenate([body.velocity, zero[:, None]], axis=-1),
-        yaw=body.yaw,
-        yaw_rate=body.yaw_rate,
-        upright=jnp.ones_like(zero),
-        steer=jnp.arctan(wheelbase * body.curvature),
-        contact_force=body.contact_force,
-        mu=body.mu,
-        friction_utilization=body.friction_utilization,
-        slip=zero,
-    )
-    return lift_motion(motion, body.ground)
+    return make_motion(body, body.velocity, jnp.arctan(wheelbase * body.curvature), height=height)
