@@ -243,6 +243,8 @@ def _plan_training(settings: dict[str, Any], variant: str, overrides: list[str],
         entry["scenes"].pop("take")  # its seed follows that of the run
     if settings["start_from"] is None:
         entry.pop("start_from")  # runs of before there was the key are the same
+    if settings["learner"].get("raw_penalty") == 0.0:
+        entry["learner"] = {name: value for name, value in settings["learner"].items() if name != "raw_penalty"}  # so, too
     digest, seed = result_file.digest(entry), settings["seed"]
     existing = sorted(runs.glob(f"*-{digest}/"))  # another study may have trained it under another name
     folder = existing[0] if existing else runs / f"{slug(variant)}-{seed}-{digest}"
