@@ -4,13 +4,13 @@ import numpy as np
 
 from scenefactory_jax.core.pytree import replace
 from scenefactory_jax.core.types import ROUTE_SPACING_M, Routes, TrafficControls
-from scenefactory_jax.roadgraph.route_sets import resample
+from scenefactory_jax.roadgraph.route_sets import sample_track
 from support.hand_scenes import column_of, scene_of
 
 
 def routes_of(lines, *, owners=None, limits=None, stops=None, drawn=None):
     """Polylines [N, 2] as routes; `stops`: for each route (arc, control) pairs; `limits` m/s."""
-    sampled = [resample(np.asarray(line, float), 1e6) for line in lines]
+    sampled = [sample_track(np.asarray(line, float), 1e6) for line in lines]
     points = max(len(xy) for xy, *_ in sampled)
     position = np.stack([np.concatenate([xy, np.tile(xy[-1], (points - len(xy), 1))]) for xy, *_ in sampled])
     count, stops = len(lines), stops or [[] for _ in lines]
@@ -22,7 +22,7 @@ def routes_of(lines, *, owners=None, limits=None, stops=None, drawn=None):
     limit = np.full((count, points), np.inf) if limits is None else np.repeat(np.asarray(limits, float)[:, None], points, axis=1)
     return Routes(
         position=column_of(position),
-        length=column_of([length for _, length, _ in sampled]),
+        length=column_of([route.length for route in sampled]),
         speed_limit=column_of(limit),
         lane=column_of(np.zeros((count, points)), np.int32),
         along_lanes=column_of(np.ones(count), bool),
