@@ -23,6 +23,7 @@ AS_TRAINED = "as trained"
 LABELS = {name: metric.label for name, metric in METRICS.items()}
 LABELS |= {"success_rate": "success", "clean_success_rate": "without any other event", "collision_rate": "collisions"}
 HOLM = f"\\*: below {LEVEL:g} after Holm's correction for all comparisons of the same metric, {{family}} and protocol."
+SINGLE = " With one seed they are differences of these trained policies; another training of the same kind may differ by more."
 INTERPRETATION = "interpretation.md"  # of the result; written by a person
 
 
@@ -121,6 +122,7 @@ def _differences(changes: Sequence[Mapping[str, Any]], metrics: Sequence[str], *
         "The second less the first, on the same scenes, cars and seeds. If all true differences were zero, about one 95 % interval in "
         f"twenty would still exclude zero: {intervals / 20:.1f} of the {intervals} in this table. {without_zero} of them do. "
         + (HOLM.format(family=family) if has_p else "No correction for multiple comparisons is applied.")
+        + (SINGLE if family == "condition" and all(max(entry["seeds"]) == 1 for entry in changes) else "")
     )
     findings = find_findings(changes, metrics, family=family)
     return [text, tables.format_rows(["From", "To", family.capitalize(), "Protocol"], cells, metrics, signed=True, findings=findings)]
