@@ -22,6 +22,7 @@ TASK = tuple(group for group in environment.GROUPS if group != "termination")  #
 LEARNER = (*TASK, "termination", "policy", "learner", "ppo", "devices")  # groups that the compiled training depends on
 # Keys that do not change what is learnt
 IGNORED = ("name", "out", "resume", "progress", "loggers", "checkpoint_every", "checkpoints_kept", "evaluation")
+UNCHANGED = (("raw_penalty", 0.0), ("parameter_ema_decay", None))  # of a learner: runs of before there was the key are the same
 ACTOR = ("actor", "values")  # of a learner, that decide what network its policy is
 SHARED = ("seed", "repeats", "planner_overrides")  # of a protocol: those of the study's decide for all conditions
 TRAINED, UNTRAINED = "checkpoints", "untrained"  # weights: a run's checkpoints, or those before training
@@ -243,8 +244,7 @@ def _plan_training(settings: dict[str, Any], variant: str, overrides: list[str],
         entry["scenes"].pop("take")  # its seed follows that of the run
     if settings["start_from"] is None:
         entry.pop("start_from")  # runs of before there was the key are the same
-    if settings["learner"].get("raw_penalty") == 0.0:
-        entry["learner"] = {name: value for name, value in settings["learner"].items() if name != "raw_penalty"}  # so, too
+    entry["learner"] = {name: value for name, value in settings["learner"].items() if (name, value) not in UNCHANGED}
     digest, seed = result_file.digest(entry), settings["seed"]
     existing = sorted(runs.glob(f"*-{digest}/"))  # another study may have trained it under another name
     folder = existing[0] if existing else runs / f"{slug(variant)}-{seed}-{digest}"

@@ -21,7 +21,7 @@ from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
 from scenefactory_jax.core import schema, sharding
 from scenefactory_jax.core.pytree import replace, to_strong_type
-from scenefactory_jax.core.schema import ConfigError, Count, Positive
+from scenefactory_jax.core.schema import ConfigError, Count, Fraction, Positive
 from scenefactory_jax.core.types import Env, Observation, Policy, Scene
 from scenefactory_jax.learning import replay_buffer, rollout, trainer
 from scenefactory_jax.learning.replay_buffer import Buffer, Storage
@@ -45,6 +45,7 @@ class OffPolicyConfig:
     shards: int | None  # groups of worlds with a part of the buffer and of each batch; None: one a device
     max_grad_norm: Positive | None  # of each network's gradient; None: not bounded
     stagger_episodes: bool  # worlds start at random times of their episodes
+    parameter_ema_decay: Fraction | None  # of the running mean of the actor's parameters, which is evaluated; None: the last ones are
 
     def __post_init__(self) -> None:
         if self.horizon % self.unroll:
@@ -222,6 +223,7 @@ def train_iteration(rounds: Rounds, train_state: TrainState, scenes: Scene) -> t
     train_state = replace(
         train_state,
         parameters=learnt.parameters,
+        ema_parameters=trainer.advance_ema(train_state, learnt.parameters, rounds.config.parameter_ema_decay),
         learner=train_state.learner | {name: learnt.learner},
         optimizer=train_state.optimizer | {name: learnt.optimizer},
         buffer=train_state.buffer | {name: buffer},
@@ -256,7 +258,8 @@ def init_train_state(parts: Sequence[Rounds], key: PRNGKeyArray, scenes: Scene, 
     Raises:
         ConfigError: worlds that the shards do not divide; a buffer that is too small for a round, or larger than the memory.
     """
-    train_state = trainer.init_train_state(key, scenes, parts[0].env, policy, optax.identity(), starts=starts, ema=False)
+    env, ema = parts[0].env, parts[0].config.parameter_ema_decay is not None
+    train_state = trainer.init_train_state(key, scenes, env, policy, optax.identity(), starts=starts, ema=ema)
     worlds, needed, buffers, learnt = train_state.worlds, 0, {}, {}
     count, agents = worlds.state.active.shape
     for index, rounds in enumerate(parts, start=1):

@@ -172,6 +172,17 @@ def test_a_killed_and_resumed_run_is_the_unbroken_one(course, name, tmp_path):
     jax.tree.map(np.testing.assert_array_equal, parameters, get_policy_parameters(unbroken))
 
 
+def test_the_running_mean_of_an_actor_is_evaluated(course):
+    learner, stage = course("bc_sac")[1], scenes(WORLDS)
+    state = learner.init(jax.random.key(0), stage)
+    mean = jax.device_get(state.parameters)
+    for weight in (0.0, 0.5, 0.5):
+        state, _ = learner.train_iteration(state, stage)
+        mean = jax.tree.map(lambda old, new, weight=weight: weight * old + (1 - weight) * new, mean, jax.device_get(state.parameters))
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-5, atol=1e-7), get_policy_parameters(state), mean)
+    assert any((leaf != last).any() for leaf, last in zip(jax.tree.leaves(mean), jax.tree.leaves(state.parameters), strict=True))
+
+
 @pytest.mark.parametrize("life, length", [(3, 5), (3, 2)])
 def test_samples_of_empty_slots_and_of_the_time_limit_are_not_stored(life, length):
     """Worlds end with their agents after 3 steps, or by the time limit after 2, in which each agent's second sample is cut."""

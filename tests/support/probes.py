@@ -74,6 +74,7 @@ REPLAY = dict(
     shards=None,
     max_grad_norm=10.0,
     stagger_episodes=False,
+    parameter_ema_decay=None,
 )
 CRITICS = dict(learning_rate=1e-2, critic_learning_rate=1e-2, gamma=0.9, tau=0.05)
 SOFT = dict(actor="tanh_gaussian", alpha=0.01, entropy_target=None, alpha_learning_rate=1e-2, raw_penalty=0.0)
@@ -89,7 +90,8 @@ LEARNERS = {
     | CRITICS
     | SOFT
     | EXPERT
-    | dict(imitation_every=2, imitation_learning_rate=1e-2, imitation_loss="squared_error", expert_buffer=256),
+    | dict(imitation_every=2, imitation_learning_rate=1e-2, imitation_loss="squared_error", expert_buffer=256)
+    | dict(parameter_ema_decay=0.5),
 }
 STEERS = 0.3  # action of the probes' expert that no reward asks for
 
