@@ -24,6 +24,7 @@ from scenefactory_jax.learning import replay_buffer
 from scenefactory_jax.learning.replay_buffer import Buffer
 
 PARAMETERS, AVERAGED, LEARNT, BUFFER = "parameters/", "ema_parameters/", "learner/", "buffer/"  # paths of arrays begin with these
+NETWORKS = (PARAMETERS, AVERAGED, LEARNT)  # what a finished run is left with
 NETWORK = "/params/"  # behind the path of a network
 HOST = "host"  # JSON text of the values that the training loop adds
 FILE = "policy.npz"  # in place of checkpoints: parameters alone
@@ -71,9 +72,9 @@ def latest(folder: Path | str) -> int | None:
 
 
 def drop_training_state(folder: Path | str) -> None:
-    """Removes all but the parameters of the newest checkpoint: for a run that will not be resumed."""
+    """Removes all but the networks of the newest checkpoint: for a run that will not be resumed; others may start from it."""
     *earlier, newest = _list_iterations(folder)
-    _write(_path(folder, newest), _load(_path(folder, newest), PARAMETERS) | _load(_path(folder, newest), AVERAGED))
+    _write(_path(folder, newest), {name: value for name, value in _load(_path(folder, newest)).items() if name.startswith(NETWORKS)})
     _remove(folder, earlier)
     _buffer_path(_path(folder, newest)).unlink(missing_ok=True)
 
@@ -92,8 +93,8 @@ def restore(folder: Path | str, like: Any, iteration: int | None = None) -> Any:
     """
     file = _find(folder, iteration)
     stored = {name: value for name, value in _load(file).items() if name != HOST}
-    if all(name.startswith((PARAMETERS, AVERAGED)) for name in stored):
-        raise ConfigError(f"{file}: has parameters only; training cannot go on from it")
+    if all(name.startswith(NETWORKS) for name in stored):
+        raise ConfigError(f"{file}: has networks only; training cannot go on, only start_from this run")
     leaves = name_leaves(like)
     stored |= _load_buffers(file, like, missing=not any(name.startswith(BUFFER) for name in stored))
     stored |= _regroup_buffers(stored, like)

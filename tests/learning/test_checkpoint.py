@@ -241,13 +241,13 @@ def test_empty_arrays_and_half_precision_survive(saved, tmp_path):
     assert_same(checkpoint.restore(tmp_path, odd), odd)
 
 
-def test_a_stripped_checkpoint_has_parameters_alone(saved, trainer, tmp_path):
+def test_a_stripped_checkpoint_has_networks_alone(saved, trainer, tmp_path):
     folder = shutil.copytree(saved[0], tmp_path / "run")
     parameters, size = checkpoint.restore_parameters(folder), (folder / "3.npz").stat().st_size
     checkpoint.drop_training_state(folder)
     assert sorted(file.name for file in folder.glob("*.npz")) == ["3.npz"] and (folder / "3.npz").stat().st_size < size
     assert_same(checkpoint.restore_parameters(folder), parameters)
-    with pytest.raises(ConfigError, match="has parameters only; training cannot go on"):
+    with pytest.raises(ConfigError, match="has networks only; training cannot go on, only start_from this run"):
         checkpoint.restore(folder, begin(trainer))
 
 
@@ -292,7 +292,10 @@ def test_a_new_training_starts_from_the_networks_of_another(trainer, saved):
 
 def test_critics_are_taken_if_they_fit_and_numbers_never(tmp_path):
     ones = {name: np.ones(shape, np.float32) for name, shape in SHAPES.items()}
-    folder = _write(tmp_path, ones | {"learner/target/params/kernel": np.ones(4, np.float32)})
+    arrays = ones | {"learner/target/params/kernel": np.ones(4, np.float32)}
+    folder = _write(tmp_path, arrays | {"optimizer/mu": np.ones(3, np.float32)})
+    checkpoint.drop_training_state(folder)  # a finished run keeps its critics
+    assert set(np.load(folder / "7.npz").files) == set(arrays) - {"past/parameters/params/bias"}
     nested = traverse_util.unflatten_dict({name: jnp.zeros(shape) for name, shape in SHAPES.items()}, sep="/")
     started, taken = checkpoint.put_networks(folder, nested)
     assert taken == ["parameters/", "learner/critics/params/"]
