@@ -168,12 +168,30 @@ def descend(
     Args:
         objective: of the parameters, with metrics; on several devices each device's summand of both.
     """
-    result = jax.value_and_grad(objective, has_aux=True)(parameters)
-    (total, metrics), gradient = sharding.sum_over_devices(result, axis)
-    norm = optax.global_norm(gradient)
-    updates, adapted = adam.update(gradient, state, parameters)
-    changed = jnp.isfinite(total) & jnp.isfinite(norm)
-    return optax.apply_updates(parameters, updates), adapted, {**metrics, "gradient_norm": norm, "changed": changed}
+    [(moved, adapted)], metrics, [norm] = descend_each(lambda trees: objective(*trees), [adam], (parameters,), (state,), axis)
+    return moved, adapted, {**metrics, "gradient_norm": norm}
+
+
+def descend_each(
+    objective: Callable[[Any], tuple[Array, Metrics]],
+    adams: Sequence[optax.GradientTransformation],
+    trees: tuple[Any, ...],
+    states: tuple[Any, ...],
+    axis: str | None,
+) -> tuple[list[tuple[Any, Any]], Metrics, list[Array]]:
+    """Makes one gradient step of several networks by one objective, see `descend`.
+
+    Returns:
+        Parameters and state of each; the metrics, with `changed`; the norm of each gradient.
+    """
+    result = jax.value_and_grad(objective, has_aux=True)(trees)
+    (total, metrics), gradients = sharding.sum_over_devices(result, axis)
+    norms, moved = [optax.global_norm(gradient) for gradient in gradients], []
+    for adam, gradient, state, tree in zip(adams, gradients, states, trees, strict=True):
+        updates, adapted = adam.update(gradient, state, tree)
+        moved.append((optax.apply_updates(tree, updates), adapted))
+    changed = jnp.isfinite(total) & jnp.all(jnp.isfinite(jnp.stack(norms)))
+    return moved, {**metrics, "changed": changed}, norms
 
 
 def select(condition: Bool[Array, ""], chosen: Any, other: Any) -> Any:

@@ -65,6 +65,22 @@ def test_each_critic_is_the_network_alone(critic):
         np.testing.assert_allclose(derive(twice, ACTION)[1][0], values[index], atol=1e-5)
 
 
+@pytest.mark.parametrize("name", ["none", "lq"])
+def test_networks_read_features_of_one_pass(name):
+    """What actor and critics read of features that are computed together is what they read of the observation."""
+    policy = actor_critic.make(encoder={"_target_": name, **ENTRIES[name]}, **POLICY, actor="tanh_gaussian", numbers=2)
+    networks = policy.networks
+    parameters, critics = encoding.draw(policy, OBSERVATION), encoding.draw(networks.critic, OBSERVATION, ACTION, seed=1)
+
+    @jax.jit
+    def compare(parameters, critics):
+        read = networks.read(networks.encode(parameters, critics, OBSERVATION))
+        return [(*one.distribution(parameters, OBSERVATION), one.critic.apply(critics, OBSERVATION, ACTION)) for one in (read, networks)]
+
+    for found, expected in zip(*compare(parameters, critics), strict=True):
+        np.testing.assert_allclose(found, expected, rtol=1e-4, atol=1e-5)
+
+
 def test_critics_begin_with_other_weights():
     network = heads.make_critic(encoding.make_encoder("mlp"), 2, **HEAD)
     drawn = jax.device_get(jax.jit(network.init)(jax.random.key(0), OBSERVATION, ACTION))

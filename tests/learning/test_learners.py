@@ -42,7 +42,13 @@ LINEAR = Networks(
     "tanh_gaussian",
     1,
     lambda p, seen: (p * seen["x"], jnp.full_like(seen["x"], 0.5)),
-    Network(lambda *_: None, lambda c, seen, action: jnp.stack([c[0] * (seen["x"] + action)[..., 0], c[1] * (seen["x"] - action)[..., 0]])),
+    Network(
+        *[lambda c, seen, action: jnp.stack([c[0] * (seen["x"] + action)[..., 0], c[1] * (seen["x"] - action)[..., 0]])] * 2,
+        encode=lambda *_: None,
+        read=lambda *_: None,
+    ),
+    encode=lambda *_: None,
+    read=lambda *_: None,
 )
 SEEN, MADE, NOISE = (jnp.array(x)[:, None] for x in ([1.0, -2.0, 0.5], [0.2, -0.4, 0.9], [0.3, -1.0, 2.0]))
 C, P, WEIGHT = jnp.array([1.5, -0.5]), jnp.float32(0.7), jnp.array([1.0, 1.0, 0.0])
@@ -244,6 +250,42 @@ def test_the_actor_of_td3_waits():
     for pick in (lambda x: x.parameters, lambda x: x.learner.target, lambda x: x.learner.target_actor):
         assert stays(pick) == [True, True, False]
     assert stays(lambda x: x.learner.critics) == [False, False, False]
+
+
+def test_each_network_of_sac_moves_by_its_own_loss():
+    """Features of all three are computed in one pass; the steps are those of the two losses alone."""
+    policy, config = late_fusion.make(**SMALL, actor="tanh_gaussian", numbers=2), schema.read(LEARNERS["sac"], SACConfig, where="learner")
+    whole, networks = sac.SAC(policy, config), policy.networks
+    draw = np.random.default_rng(0).normal
+    cue, following = ({"cue": jnp.array(draw(size=(1, 4, 1)), jnp.float32)} for _ in range(2))
+    rows = {"observation": cue, "next_observation": following, "action": jnp.tanh(jnp.array(draw(size=(1, 4, 2)), jnp.float32))}
+    rows |= {"reward": jnp.ones((1, 4)), "follows": jnp.array([[True, True, False, True]])}
+    weight, total = jnp.array([[1.0, 1.0, 1.0, 0.0]]), jnp.float32(3.0)
+
+    @jax.jit
+    def compare(key):
+        learnt = sac.init(whole, key, policy.init(key, cue), cue)
+        learnt = learnt._replace(learner=learnt.learner._replace(target=jax.tree.map(lambda leaf: 1.1 * leaf, learnt.learner.critics)))
+        noise, next_noise = (rollout.sample_noise(one, rows["action"], None) for one in jax.random.split(key))
+        action, density = sac_loss.sample_action(*networks.distribution(learnt.parameters, following), next_noise)
+        values, numbers = networks.critic.apply(learnt.learner.target, following, action), {"alpha": jnp.float32(config.alpha)}
+        aim = sac_loss.compute_target(rows["reward"], rows["follows"] * 1.0, values, density, gamma=config.gamma, **numbers)
+        sums = {"weight": weight, "networks": networks, "total": total}
+        of_critics = functools.partial(critics.compute_critic_loss, rows=rows, target=aim, **sums)
+        of_actor = functools.partial(sac_loss.compute_actor_loss, critics=learnt.learner.critics, observation=cue, noise=noise, **sums)
+        losses = functools.partial(of_actor, raw_penalty=0.0, **numbers), of_critics
+        trees = learnt.parameters, learnt.learner.critics
+        states = learnt.optimizer.actor, learnt.optimizer.critics
+        steps = [off_policy.descend(*parts, None) for parts in zip(losses, whole.optimizers, trees, states, strict=False)]
+        return sac.update(whole, learnt, rows, weight, key), steps
+
+    (after, metrics), ((parameters, _, actor), (moved, _, critic)) = jax.device_get(compare(jax.random.key(3)))
+    for found, expected in ((after.parameters, parameters), (after.learner.critics, moved)):
+        jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-4, atol=1e-6), found, expected)
+    alone = actor | {"actor_gradient_norm": actor["gradient_norm"]} | critic
+    assert metrics.pop("alpha") == np.float32(config.alpha) and metrics.keys() == alone.keys()
+    for name, value in metrics.items():
+        np.testing.assert_allclose(value, alone[name], rtol=1e-4, atol=1e-6, err_msg=name)
 
 
 def test_an_update_that_is_not_finite_changes_nothing():

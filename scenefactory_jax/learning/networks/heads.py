@@ -33,10 +33,15 @@ lecun_uniform = nn.initializers.lecun_uniform()
 
 
 class Network(NamedTuple):
-    """`init(key, *inputs) -> parameters` and `apply(parameters, *inputs)`; inputs are an observation and, of critics, an action."""
+    """`init(key, *inputs) -> parameters` and `apply(parameters, *inputs)`; inputs are an observation and, of critics, an action.
+
+    `apply` is `encode(parameters, observation) -> feature`, then `read(parameters, feature, *others)`.
+    """
 
     init: Callable[..., Any]
     apply: Callable[..., Any]
+    encode: Callable[..., Any]
+    read: Callable[..., Any]
 
 
 def make_encoder(entry: Mapping[str, Any], *, observations: Mapping[str, Any], dtype: str, where: str = "policy.encoder") -> Encoder:
@@ -69,14 +74,28 @@ def make_actor(
     """
     if activation not in ACTIVATIONS:
         raise ConfigError(f"policy.activation: expected one of {', '.join(ACTIVATIONS)}, got {activation!r}")
-    tower = Tower(encoder, functools.partial(Head, tuple(hidden), outputs, activation, dtype, activate_last=activate_last))
-    return Network(tower.init, tower.apply)
+    return make_network(encoder, functools.partial(Head, tuple(hidden), outputs, activation, dtype, activate_last=activate_last))
+
+
+def make_network(encoder: Encoder, head: Callable[..., nn.Module]) -> Network:
+    """Joins an encoder and a head, both functions that return a new module."""
+    tower = Tower(encoder, head)
+
+    def encode(parameters: Any, observation: Observation) -> Array:
+        return encoder().apply({"params": parameters["params"].get("encoder", {})}, observation)  # pyright: ignore[reportReturnType]
+
+    def read(parameters: Any, feature: Array, *extra: Array) -> Array:
+        joined = jnp.concatenate([feature, *extra], axis=-1)
+        return head().apply({"params": parameters["params"]["head"]}, joined)  # pyright: ignore[reportReturnType]
+
+    return Network(tower.init, tower.apply, encode, read)
 
 
 def make_value(encoder: Encoder, *, hidden: Sequence[Count], activation: str, dtype: str = "float32") -> Network:
     """Builds `apply(parameters, observation) -> [...]`."""
     value = make_actor(encoder, 1, hidden=hidden, activation=activation, dtype=dtype)
-    return Network(value.init, lambda parameters, observation: value.apply(parameters, observation)[..., 0])
+    apply, read = ((lambda *inputs, call=call: call(*inputs)[..., 0]) for call in (value.apply, value.read))
+    return Network(value.init, apply, value.encode, read)
 
 
 def make_critic(
@@ -94,7 +113,13 @@ def make_critic(
     def apply(parameters: Any, observation: Observation, action: Float[Array, "*batch D"]) -> Float[Array, "count *batch"]:
         return jax.vmap(lambda parameters: one.apply(parameters, observation, action)[..., 0])(parameters)
 
-    return Network(init, apply)
+    def encode(parameters: Any, observation: Observation) -> Float[Array, "count *batch W"]:
+        return jax.vmap(one.encode, in_axes=(0, None), axis_size=count)(parameters, observation)
+
+    def read(parameters: Any, feature: Float[Array, "count *batch W"], action: Float[Array, "*batch D"]) -> Float[Array, "count *batch"]:
+        return jax.vmap(lambda *of_one: one.read(*of_one, action)[..., 0])(parameters, feature)
+
+    return Network(init, apply, encode, read)
 
 
 def split_gaussian(raw: Float[Array, "*batch twice"]) -> tuple[Float[Array, "*batch D"], Float[Array, "*batch D"]]:

@@ -16,7 +16,7 @@ from jaxtyping import Array, Float, PRNGKeyArray
 
 from scenefactory_jax.core.schema import ConfigError
 from scenefactory_jax.core.types import Observation, Policy
-from scenefactory_jax.learning.networks.heads import MIN_STD, Encoder, Head, Network, Tower, make_critic, split_gaussian
+from scenefactory_jax.learning.networks.heads import MIN_STD, Encoder, Head, Network, make_critic, make_network, split_gaussian
 
 Actor = Literal["gaussian", "tanh_gaussian", "deterministic"]
 """gaussian: of PPO, not squashed."""
@@ -31,6 +31,8 @@ class Networks(NamedTuple):
     numbers: int
     distribution: Callable[[Any, Observation], tuple[Array, Array]]  # (parameters, observation) -> mean, std [..., D] before the tanh
     critic: Network  # (parameters, observation, action [..., D]) -> values [2, ...]
+    encode: Callable[[Any, Any, Observation], Array]  # (parameters, critics, observation) -> features [3, ..., W] of all three, in one pass
+    read: Callable[[Array], Any]  # features -> networks that read these, whatever observation they are given
 
 
 def make(
@@ -66,11 +68,14 @@ def make(
             raise ConfigError(f"policy.log_std_init: expected a number above the logarithm of {MIN_STD}, got {log_std_init}")
         bias += [math.log(math.expm1(spread))] * numbers
     last = nn.initializers.orthogonal(actor_head_scale), lambda *_: jnp.array(bias, jnp.float32)
-    tower = Tower(encoder, functools.partial(Head, tuple(hidden), len(bias), activation, dtype, *last, activate_last))
+    network = make_network(encoder, functools.partial(Head, tuple(hidden), len(bias), activation, dtype, *last, activate_last))
+    critic = make_critic(encoder, 2, hidden=hidden, activation=activation, dtype=dtype, activate_last=activate_last)
+
+    def split(raw: Array) -> tuple[Array, Array]:
+        return split_gaussian(raw) if is_random else (raw, jnp.zeros_like(raw))
 
     def distribution(parameters: Any, observation: Observation) -> tuple[Array, Array]:
-        raw: Any = tower.apply(parameters, observation)
-        return split_gaussian(raw) if is_random else (raw, jnp.zeros_like(raw))
+        return split(network.apply(parameters, observation))
 
     def apply(parameters: Any, observation: Observation) -> tuple[Array, Array, Array]:
         mean, std = distribution(parameters, observation)
@@ -78,8 +83,17 @@ def make(
         log_std = jnp.log(std * (1.0 - action**2))  # of the squashed action, to first order; -inf without noise
         return pad_action(action), pad_action(log_std, fill=-jnp.inf), jnp.zeros_like(action[..., 0])
 
-    critic = make_critic(encoder, 2, hidden=hidden, activation=activation, dtype=dtype, activate_last=activate_last)
-    return Policy(tower.init, apply, Networks(actor, numbers, distribution, critic))  # pyright: ignore[reportArgumentType]
+    def encode(parameters: Any, critics: Any, observation: Observation) -> Float[Array, "3 *batch W"]:
+        own, others = (tree["params"].get("encoder", {}) for tree in (parameters, critics))
+        trees = jax.tree.map(lambda one, two: jnp.concatenate([one[None], two]), own, others)
+        return jax.vmap(lambda tree: network.encode({"params": {"encoder": tree}}, observation), axis_size=3)(trees)
+
+    def read(features: Float[Array, "3 *batch W"]) -> Networks:
+        of_critics = critic._replace(apply=lambda critics, _, action: critic.read(critics, features[1:], action))
+        return networks._replace(distribution=lambda parameters, _: split(network.read(parameters, features[0])), critic=of_critics)
+
+    networks = Networks(actor, numbers, distribution, critic, encode, read)
+    return Policy(network.init, apply, networks)  # pyright: ignore[reportArgumentType]
 
 
 def pad_action(action: Float[Array, "*batch D"], fill: float = 0.0) -> Float[Array, "*batch 3"]:

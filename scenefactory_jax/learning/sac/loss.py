@@ -12,6 +12,7 @@ from jaxtyping import Array, Float
 
 from scenefactory_jax.core.types import Observation
 from scenefactory_jax.learning import gaussian
+from scenefactory_jax.learning.critics import compute_critic_loss
 from scenefactory_jax.learning.means import partial_mean
 from scenefactory_jax.learning.networks.squashed import Networks
 
@@ -61,6 +62,38 @@ def compute_actor_loss(
     average = functools.partial(partial_mean, weight=weight, total=total)
     loss = average(alpha * log_probability - value + raw_penalty * jnp.sum(mean**2, axis=-1))
     return loss, jax.lax.stop_gradient({"actor_loss": loss, "entropy": -average(log_probability)})
+
+
+def compute_losses(
+    trees: tuple[Any, Any],
+    rows: dict[str, Any],
+    target: Float[Array, "*batch"],
+    noise: Float[Array, "*batch D"],
+    weight: Float[Array, "*batch"],
+    *,
+    alpha: Float[Array, ""],
+    raw_penalty: float,
+    networks: Networks,
+    total: Array,
+) -> tuple[Float[Array, ""], dict[str, Float[Array, ""]]]:
+    """Computes the sum of the losses of actor and critics, each of which moves its own network.
+
+    The features of the observation are computed once for both, and in one pass: with small batches it is the number of passes that takes
+    the time of a GPU.
+
+    Args:
+        trees: parameters of the actor, and of the critics.
+        target: of the critics.
+        noise: of the actor's actions.
+    """
+    parameters, critics = trees
+    observation = rows["observation"]
+    features = networks.encode(parameters, critics, observation)
+    frozen = networks.read(jnp.concatenate([features[:1], jax.lax.stop_gradient(features[1:])]))
+    critic_loss, metrics = compute_critic_loss(critics, rows, target, weight, networks=networks.read(features), total=total)
+    numbers: dict[str, Any] = {"alpha": alpha, "raw_penalty": raw_penalty, "networks": frozen, "total": total}
+    actor_loss, found = compute_actor_loss(parameters, jax.lax.stop_gradient(critics), observation, noise, weight, **numbers)
+    return critic_loss + actor_loss, metrics | found
 
 
 def compute_alpha_loss(

@@ -19,7 +19,6 @@ from scenefactory_jax.core import sharding
 from scenefactory_jax.core.types import Env, Observation, Policy, Scene
 from scenefactory_jax.env import environment
 from scenefactory_jax.learning import off_policy, replay_buffer, rollout
-from scenefactory_jax.learning.critics import compute_critic_loss
 from scenefactory_jax.learning.networks import squashed
 from scenefactory_jax.learning.networks.squashed import Networks
 from scenefactory_jax.learning.off_policy import Learner, Learnt
@@ -93,27 +92,30 @@ def update(sac: SAC, learnt: Learnt, rows: dict[str, Any], weight: Float[Array, 
     noise, next_noise = (rollout.sample_noise(one, rows["action"], axis) for one in jax.random.split(key))
     total, alpha = sharding.sum_over_devices(jnp.sum(weight), axis), jnp.exp(log_alpha)
 
-    following = loss.sample_action(*networks.distribution(learnt.parameters, rows["next_observation"]), next_noise)
-    values = networks.critic.apply(target, rows["next_observation"], following[0])
-    aim = loss.compute_target(rows["reward"], rows["follows"] * 1.0, values, following[1], alpha=alpha, gamma=config.gamma)
-    of_critics = functools.partial(compute_critic_loss, rows=rows, target=aim, weight=weight, networks=networks, total=total)
-    moved, critic_state, metrics = off_policy.descend(of_critics, critic_adam, critics, states.critics, axis)
+    following = rows["next_observation"]
+    readers: Networks = networks.read(networks.encode(learnt.parameters, target, following))
+    action, log_probability = loss.sample_action(*readers.distribution(learnt.parameters, following), next_noise)
+    values = readers.critic.apply(target, following, action)
+    aim = loss.compute_target(rows["reward"], rows["follows"] * 1.0, values, log_probability, alpha=alpha, gamma=config.gamma)
 
-    constants = {"observation": rows["observation"], "noise": noise, "weight": weight, "total": total, "raw_penalty": config.raw_penalty}
-    of_actor = functools.partial(loss.compute_actor_loss, critics=critics, alpha=alpha, networks=networks, **constants)
-    parameters, actor_state, found = off_policy.descend(of_actor, actor_adam, learnt.parameters, states.actor, axis)
-    changed = metrics["changed"] & found["changed"]
+    sums = {"weight": weight, "networks": networks, "total": total}
+    objective = functools.partial(
+        loss.compute_losses, rows=rows, target=aim, noise=noise, alpha=alpha, raw_penalty=config.raw_penalty, **sums
+    )
+    adams, both = [actor_adam, critic_adam], (learnt.parameters, critics)
+    steps, metrics, norms = off_policy.descend_each(objective, adams, both, (states.actor, states.critics), axis)
+    (parameters, actor_state), (moved, critic_state) = steps
 
     alpha_state = states.alpha
     if config.entropy_target is not None:
         aimed = config.entropy_target * networks.numbers
-        slope = jax.grad(loss.compute_alpha_loss)(log_alpha, found["entropy"], target=aimed)
+        slope = jax.grad(loss.compute_alpha_loss)(log_alpha, metrics["entropy"], target=aimed)
         step, alpha_state = alpha_adam.update(slope, alpha_state)
         log_alpha = log_alpha + step
     learner = Critics(moved, off_policy.move_towards(target, moved, config.tau), log_alpha)
     new = Learnt(parameters, learner, Optimizers(actor_state, critic_state, alpha_state))
-    metrics |= found | {"alpha": alpha, "gradient_norm": metrics["gradient_norm"], "actor_gradient_norm": found["gradient_norm"]}
-    return off_policy.select(changed, new, learnt), metrics | {"changed": changed}
+    metrics |= {"alpha": alpha, "actor_gradient_norm": norms[0], "gradient_norm": norms[1]}
+    return off_policy.select(metrics["changed"], new, learnt), metrics
 
 
 def make_learner(policy: Policy, config: SACConfig, axis: str | None) -> Learner:
