@@ -74,7 +74,7 @@ def latest(folder: Path | str) -> int | None:
 def drop_training_state(folder: Path | str) -> None:
     """Removes all but the networks of the newest checkpoint: for a run that will not be resumed; others may start from it."""
     *earlier, newest = _list_iterations(folder)
-    _write(_path(folder, newest), {name: value for name, value in _load(_path(folder, newest)).items() if name.startswith(NETWORKS)})
+    _write(_path(folder, newest), _load(_path(folder, newest), NETWORKS))
     _remove(folder, earlier)
     _buffer_path(_path(folder, newest)).unlink(missing_ok=True)
 
@@ -244,8 +244,8 @@ def _write(file: Path, arrays: Mapping[str, np.ndarray], *, savez: Callable[...,
         savez(opened, **arrays)
 
 
-def _load(file: Path, prefix: str = "") -> Arrays:
-    """Reads the arrays whose names begin with a prefix; numpy reads bfloat16 as two bytes without a type."""
+def _load(file: Path, prefix: str | tuple[str, ...] = "") -> Arrays:
+    """Reads the arrays whose names begin with a prefix, or with one of several; numpy reads bfloat16 as two bytes without a type."""
     with np.load(file) as stored:
         arrays = {name: stored[name] for name in stored.files if name.startswith(prefix)}
     return {name: value.view(jnp.bfloat16) if value.dtype.kind == "V" else value for name, value in arrays.items()}

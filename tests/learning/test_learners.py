@@ -44,7 +44,6 @@ LINEAR = Networks(
     lambda p, seen: (p * seen["x"], jnp.full_like(seen["x"], 0.5)),
     Network(
         *[lambda c, seen, action: jnp.stack([c[0] * (seen["x"] + action)[..., 0], c[1] * (seen["x"] - action)[..., 0]])] * 2,
-        encode=lambda *_: None,
         read=lambda *_: None,
     ),
     encode=lambda *_: None,

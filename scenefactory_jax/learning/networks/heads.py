@@ -35,12 +35,11 @@ lecun_uniform = nn.initializers.lecun_uniform()
 class Network(NamedTuple):
     """`init(key, *inputs) -> parameters` and `apply(parameters, *inputs)`; inputs are an observation and, of critics, an action.
 
-    `apply` is `encode(parameters, observation) -> feature`, then `read(parameters, feature, *others)`.
+    `read(parameters, feature, *others)` is what follows the encoder in `apply`.
     """
 
     init: Callable[..., Any]
     apply: Callable[..., Any]
-    encode: Callable[..., Any]
     read: Callable[..., Any]
 
 
@@ -81,27 +80,24 @@ def make_network(encoder: Encoder, head: Callable[..., nn.Module]) -> Network:
     """Joins an encoder and a head, both functions that return a new module."""
     tower = Tower(encoder, head)
 
-    def encode(parameters: Any, observation: Observation) -> Array:
-        return encoder().apply({"params": parameters["params"].get("encoder", {})}, observation)  # pyright: ignore[reportReturnType]
-
     def read(parameters: Any, feature: Array, *extra: Array) -> Array:
         joined = jnp.concatenate([feature, *extra], axis=-1)
         return head().apply({"params": parameters["params"]["head"]}, joined)  # pyright: ignore[reportReturnType]
 
-    return Network(tower.init, tower.apply, encode, read)
+    return Network(tower.init, tower.apply, read)
 
 
 def make_value(encoder: Encoder, *, hidden: Sequence[Count], activation: str, dtype: str = "float32") -> Network:
     """Builds `apply(parameters, observation) -> [...]`."""
     value = make_actor(encoder, 1, hidden=hidden, activation=activation, dtype=dtype)
-    apply, read = ((lambda *inputs, call=call: call(*inputs)[..., 0]) for call in (value.apply, value.read))
-    return Network(value.init, apply, value.encode, read)
+    return Network(value.init, _take_number(value.apply), _take_number(value.read))
 
 
 def make_critic(
     encoder: Encoder, count: int = 2, *, hidden: Sequence[Count], activation: str, dtype: str = "float32", activate_last: bool = False
 ) -> Network:
-    """Builds `apply(parameters, observation, action) -> [count, ...]`: values of that many networks without shared weights.
+    """Builds `apply(parameters, observation, action) -> [count, ...]`: values of that many networks without shared weights; `read` takes
+    features [count, ..., W].
 
     Each has an encoder and a head of its own; the head reads the feature joined with the action. Parameters have the axis `count` in front.
     """
@@ -110,16 +106,13 @@ def make_critic(
     def init(key: PRNGKeyArray, observation: Observation, action: Float[Array, "*batch D"]) -> Any:
         return jax.vmap(lambda key: one.init(key, observation, action))(jax.random.split(key, count))
 
-    def apply(parameters: Any, observation: Observation, action: Float[Array, "*batch D"]) -> Float[Array, "count *batch"]:
-        return jax.vmap(lambda parameters: one.apply(parameters, observation, action)[..., 0])(parameters)
+    apply, read = _take_number(one.apply), _take_number(one.read)
+    return Network(init, jax.vmap(apply, in_axes=(0, None, None)), jax.vmap(read, in_axes=(0, 0, None)))
 
-    def encode(parameters: Any, observation: Observation) -> Float[Array, "count *batch W"]:
-        return jax.vmap(one.encode, in_axes=(0, None), axis_size=count)(parameters, observation)
 
-    def read(parameters: Any, feature: Float[Array, "count *batch W"], action: Float[Array, "*batch D"]) -> Float[Array, "count *batch"]:
-        return jax.vmap(lambda *of_one: one.read(*of_one, action)[..., 0])(parameters, feature)
-
-    return Network(init, apply, encode, read)
+def _take_number(call: Callable[..., Array]) -> Callable[..., Array]:
+    """Makes a function that returns the only output without its axis."""
+    return lambda *inputs: call(*inputs)[..., 0]
 
 
 def split_gaussian(raw: Float[Array, "*batch twice"]) -> tuple[Float[Array, "*batch D"], Float[Array, "*batch D"]]:

@@ -32,7 +32,7 @@ class Networks(NamedTuple):
     distribution: Callable[[Any, Observation], tuple[Array, Array]]  # (parameters, observation) -> mean, std [..., D] before the tanh
     critic: Network  # (parameters, observation, action [..., D]) -> values [2, ...]
     encode: Callable[[Any, Any, Observation], Array]  # (parameters, critics, observation) -> features [3, ..., W] of all three, in one pass
-    read: Callable[[Array], Any]  # features -> networks that read these, whatever observation they are given
+    read: Callable[[Array], "Networks"]  # features -> networks that read these, whatever observation they are given
 
 
 def make(
@@ -86,7 +86,7 @@ def make(
     def encode(parameters: Any, critics: Any, observation: Observation) -> Float[Array, "3 *batch W"]:
         own, others = (tree["params"].get("encoder", {}) for tree in (parameters, critics))
         trees = jax.tree.map(lambda one, two: jnp.concatenate([one[None], two]), own, others)
-        return jax.vmap(lambda tree: network.encode({"params": {"encoder": tree}}, observation), axis_size=3)(trees)
+        return jax.vmap(lambda tree: encoder().apply({"params": tree}, observation), axis_size=3)(trees)  # pyright: ignore[reportReturnType]
 
     def read(features: Float[Array, "3 *batch W"]) -> Networks:
         of_critics = critic._replace(apply=lambda critics, _, action: critic.read(critics, features[1:], action))

@@ -93,7 +93,7 @@ def update(sac: SAC, learnt: Learnt, rows: dict[str, Any], weight: Float[Array, 
     total, alpha = sharding.sum_over_devices(jnp.sum(weight), axis), jnp.exp(log_alpha)
 
     following = rows["next_observation"]
-    readers: Networks = networks.read(networks.encode(learnt.parameters, target, following))
+    readers = networks.read(networks.encode(learnt.parameters, target, following))
     action, log_probability = loss.sample_action(*readers.distribution(learnt.parameters, following), next_noise)
     values = readers.critic.apply(target, following, action)
     aim = loss.compute_target(rows["reward"], rows["follows"] * 1.0, values, log_probability, alpha=alpha, gamma=config.gamma)
