@@ -4,7 +4,7 @@ import functools
 import json
 import sys
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +21,7 @@ from scenefactory_jax.data.bank.bank_reader import Bank
 from scenefactory_jax.data.curation import ego_choice, operations
 from scenefactory_jax.data.curation.features import COLUMNS
 from scenefactory_jax.data.curation.mirroring import mirror
+from scenefactory_jax.data.curation.time_shift import shift_others
 from scenefactory_jax.data.export import gpudrive, opendrive, scenarionet, womd
 from scenefactory_jax.data.loading import scene_source
 
@@ -101,10 +102,11 @@ def egos(config: Mapping[str, Any]) -> Bank:
     return written
 
 
-def _choose_egos(bank: Bank, *, mirrored: bool, **settings: Any) -> Iterator[RawScene]:
+def _choose_egos(bank: Bank, *, mirrored: bool, shifts_s: Sequence[float], **settings: Any) -> Iterator[RawScene]:
     for raw in banks.read_raws(bank, range(len(bank))):
-        for scene in ego_choice.choose_egos(raw, **settings):
-            yield from (scene, mirror(scene)) if mirrored else (scene,)
+        for chosen in ego_choice.choose_egos(raw, **settings):
+            for scene in (chosen, *(shift_others(chosen, seconds) for seconds in shifts_s)):
+                yield from (scene, mirror(scene)) if mirrored else (scene,)
 
 
 def export(config: Mapping[str, Any]) -> int:

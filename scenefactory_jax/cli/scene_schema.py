@@ -144,6 +144,7 @@ class Egos:
     min_travel_m: Annotated[float, Bounds(min=0.0)]
     keep_recording_car: bool
     mirrored: bool
+    shifts_s: list[float]
 
 
 @dataclass(frozen=True)

@@ -41,12 +41,25 @@ def write(plan: Plan, config: Mapping[str, Any], out: Path, *, before: Mapping[s
     if before.get("rows") and not result["rows"]:
         print(f"no evaluation of this study in {config['runs']}: {out / RESULT} and its report are not changed", flush=True)
         return dict(before)
-    result = result_file.plain(result, digits=DIGITS)
+    result = _name_banks(result_file.plain(result, digits=DIGITS), config["banks"])
     out.mkdir(parents=True, exist_ok=True)
     _write_agents(out, records, digest=result_file.digest({name: config[name] for name in ("study", "evaluation", "protocol")}))
     result_file.write(out / RESULT, result, digits=DIGITS)
     print(f"{study_report.format_headline(result)}\n\nreport {study_report.write(out, result)}", flush=True)
     return result
+
+
+def _name_banks(value: Any, banks: Mapping[str, Any]) -> Any:
+    """Plain values in which an override that gives a bank gives it by its name, without the path on this machine."""
+    if isinstance(value, dict):
+        return {key: _name_banks(item, banks) for key, item in value.items()}
+    if isinstance(value, list):
+        return [_name_banks(item, banks) for item in value]
+    if isinstance(value, str):
+        for name, path in banks.items():
+            if value.endswith(f"={path}"):
+                return f"{value.removesuffix(str(path))}${{banks.{name}}}"
+    return value
 
 
 def draw(config: Mapping[str, Any]) -> dict[str, Any]:

@@ -20,7 +20,7 @@ from scenefactory_jax.evaluation.metrics.wosac_submission import SceneRollouts
 from scenefactory_jax.evaluation.records import Records
 from scenefactory_jax.evaluation.route_signals import CourseThresholds
 from scenefactory_jax.evaluation.settings import ScoreSettings
-from scenefactory_jax.learning import gaussian
+from scenefactory_jax.learning.networks import squashed
 from scenefactory_jax.learning.training_loop import make_policy
 
 ACTIONS = 2**31  # folded into the key of a world for that of its actions; a split has smaller numbers
@@ -147,8 +147,9 @@ def _make_driver(
     hook = episodes.make_hook(env, ttc_limit_s=settings["ttc_limit_s"], control_dt=1 / control_hz, **limits)
 
     def act(parameters, observation, key):
-        mean, log_std, _ = policy.apply(parameters, observation)
-        return gaussian.sample(key, mean, log_std) if settings.get("stochastic", False) else mean
+        if settings.get("stochastic", False):
+            return squashed.sample_action(policy, parameters, observation, key)
+        return policy.apply(parameters, observation)[0]
 
     @jax.jit
     def start(keys, batch):

@@ -24,7 +24,7 @@ from scenefactory_jax.env.environment import EnvParts
 from scenefactory_jax.env.traffic.idm import SIDE_M
 from scenefactory_jax.env.traffic.log_playback import VEHICLE, is_parked
 from scenefactory_jax.env.traffic.mixed import make_absent_boxes
-from scenefactory_jax.learning import gaussian
+from scenefactory_jax.learning.networks import squashed
 
 DRAW = 0x64726177  # folded into the key of a reset, for the policy that drives: apart from the numbers that others fold or split
 
@@ -65,8 +65,8 @@ def make_act(drivers: Drivers, env: Env, *, sample: bool) -> Act:
 
     def compute(parameters: Any, scene: Scene, world: State, driver: Int[Array, ""], key: PRNGKeyArray) -> Float[Array, "V 3"]:
         index = driver if count > 1 else 0  # a constant: a network with other weights in each world is slower
-        mean, log_std, _ = policy.apply(jax.tree.map(lambda leaf: leaf[index], parameters), env.observe(scene, world))
-        return gaussian.sample(key, mean, log_std) if sample else mean
+        parameters, observation = jax.tree.map(lambda leaf: leaf[index], parameters), env.observe(scene, world)
+        return squashed.sample_action(policy, parameters, observation, key) if sample else policy.apply(parameters, observation)[0]
 
     def skip(parameters: Any, scene: Scene, world: State, driver: Int[Array, ""], key: PRNGKeyArray) -> Float[Array, "V 3"]:
         return jnp.zeros((len(world.active), 3), jnp.float32)

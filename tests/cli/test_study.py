@@ -10,7 +10,7 @@ import jax
 import pytest
 from support import study_parts
 
-from scenefactory_jax.cli import hydra_config, schema, study_plan
+from scenefactory_jax.cli import hydra_config, schema, study_plan, study_results
 from scenefactory_jax.cli import study as command
 from scenefactory_jax.cli.study import study
 from scenefactory_jax.core import config as run_config
@@ -164,6 +164,12 @@ def test_uses_of_the_held_out_scenes_are_counted_over_all_calls(done):
     [use] = result["held_out_uses"]
     assert (use["policies"], use["curve points"], use["cut"]) == (9, 8, "test")
     assert "9 times for a policy" in (folder / "out" / "navigation.md").read_text()
+
+
+def test_results_give_banks_by_their_names():
+    banks, overrides = {"town": "/data/town", "womd": "/data/town/2"}, ["stream.banks.a=/data/town/2", "x=/data/town", "name=/data/towns"]
+    named = study_results._name_banks({"rows": [{"overrides": overrides, "count": 2}]}, banks)
+    assert named == {"rows": [{"overrides": ["stream.banks.a=${banks.womd}", "x=${banks.town}", "name=/data/towns"], "count": 2}]}
 
 
 def test_a_report_is_drawn_again_from_its_numbers(done, tmp_path):

@@ -339,6 +339,8 @@ def test_other_cars_take_the_recording_cars_place(tmp_path, capsys):
     assert set(scenes_of) == {raw.name, *(f"{raw.name}-{name}" for name in may)} and "from 1" in capsys.readouterr().out
     assert all(str(one.tracks[one.sdc].id) == name.removeprefix(f"{raw.name}-") for name, one in scenes_of.items() if name != raw.name)
     nearest = command(bank, "op=egos", f"out={tmp_path / 'egos'}", "egos.count=1", "egos.keep_recording_car=false")
+    shifted = command(bank, "op=egos", f"out={tmp_path / 'shifted'}", "egos.count=1", "egos.shifts_s=[-1.0,1.5]")
+    assert {name.removeprefix(raw.name) for name in shifted.names} >= {"", "-earlier1s", "-later1.5s"} and len(shifted) == 6
     place = lambda one: one.tracks[one.sdc].xyz[one.current, :2]  # noqa: E731
     away = {name: np.hypot(*(place(one) - place(raw))) for name, one in scenes_of.items() if name != raw.name}
     assert list(nearest.names) == [min(away, key=away.get)]

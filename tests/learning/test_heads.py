@@ -15,7 +15,7 @@ from support.probes import AGENTS, ppo_config, probe, scenes
 from scenefactory_jax.cli import hydra_config as configs
 from scenefactory_jax.core.instantiate import ConfigError, instantiate
 from scenefactory_jax.core.types import SetObservation
-from scenefactory_jax.learning.networks import actor_critic, heads
+from scenefactory_jax.learning.networks import actor_critic, heads, squashed
 from scenefactory_jax.learning.ppo import train_iteration
 from scenefactory_jax.learning.training_loop import make_policy
 
@@ -81,6 +81,17 @@ def test_networks_read_features_of_one_pass(name):
         np.testing.assert_allclose(found, expected, rtol=1e-4, atol=1e-5)
 
 
+def test_actions_are_sampled_under_the_tanh():
+    policy = actor_critic.make(encoder={"_target_": "none"}, **POLICY, actor="tanh_gaussian", numbers=2)
+    parameters = encoding.draw(policy, OBSERVATION)
+    keys = jax.random.split(jax.random.key(0), 4000)
+    drawn = jax.jit(jax.vmap(lambda key: squashed.sample_action(policy, parameters, OBSERVATION, key)))(keys)
+    raw, (mean, std) = np.arctanh(np.float64(drawn[..., :2])), jax.jit(policy.networks.distribution)(parameters, OBSERVATION)
+    assert not drawn[..., 2].any() and np.abs(raw.mean(0) - mean).max() < 0.1 * std.min()
+    np.testing.assert_allclose(raw.std(0), std, rtol=0.06)
+    assert np.all(policy.apply(parameters, OBSERVATION)[1] == -np.inf)  # what is evaluated has no deviation
+
+
 def test_critics_begin_with_other_weights():
     network = heads.make_critic(encoding.make_encoder("mlp"), 2, **HEAD)
     drawn = jax.device_get(jax.jit(network.init)(jax.random.key(0), OBSERVATION, ACTION))
@@ -128,10 +139,10 @@ def test_an_encoder_is_shared_only_on_demand(shared):
 
 
 def test_a_critic_has_as_many_values_as_its_learner():
-    policy = actor_critic.make(encoder={"_target_": "none"}, **POLICY, values=3)
-    drawn = jax.eval_shape(policy.init, jax.random.key(0), OBSERVATION)
-    mean, log_std, value = jax.eval_shape(policy.apply, drawn, OBSERVATION)
+    policy = actor_critic.make(encoder={"_target_": "none"}, **POLICY, values=3, numbers=2)
+    mean, log_std, value = jax.jit(policy.apply)(jax.jit(policy.init)(jax.random.key(0), OBSERVATION), OBSERVATION)
     assert (mean.shape, log_std.shape, value.shape) == ((2, 3, 3), (3,), (2, 3, 3))
+    assert not mean[..., 2].any() and log_std[2] == 0.0  # the number that is not read
 
 
 def test_critics_lower_to_the_kernels_of_sets_on_a_gpu():

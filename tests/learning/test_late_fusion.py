@@ -57,6 +57,15 @@ def test_any_leading_axes_give_the_same_numbers(tiny):
     np.testing.assert_allclose(one[2], np.asarray(value)[1], atol=1e-6)
 
 
+def test_numbers_that_are_not_read_do_not_depend_on_the_parameters(tiny):
+    """They are standard normal: no ratio of two policies, and no divergence of them, contains the third number."""
+    whole, parameters, observation = tiny
+    mean, log_std, _ = late_fusion.make(**TINY, numbers=2).apply(parameters, observation)
+    np.testing.assert_array_equal(mean[..., 2], 0.0)
+    np.testing.assert_array_equal(log_std, [-0.5, -0.5, 0.0])
+    np.testing.assert_allclose(mean[..., :2], whole.apply(parameters, observation)[0][..., :2], atol=1e-6)
+
+
 def test_widths_of_none_are_the_default_widths(tiny):
     _, parameters, observation = tiny
     init = late_fusion.make(**{**TINY, "rows": {"road": [8, 8], "neighbours": None}}).init

@@ -52,7 +52,7 @@ def make(
         head = {"hidden": hidden, "activation": activation, "dtype": dtype, "activate_last": False}
         return squashed.make(bound, actor=actor, numbers=numbers, **head, **first)
     network = ActorCritic(bound, tuple(hidden), activation, shared_encoder, **first, dtype=dtype, values=values)
-    return Policy(network.init, network.apply, encoder=bound)  # pyright: ignore[reportArgumentType]
+    return Policy(network.init, squashed.fix_unread(network.apply, numbers), encoder=bound)  # pyright: ignore[reportArgumentType]
 
 
 class ActorCritic(nn.Module):

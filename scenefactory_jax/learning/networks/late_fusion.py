@@ -92,7 +92,7 @@ def make(
     encoder = functools.partial(Fusion, architecture)
     if actor == "gaussian":
         network = ActorCritic(architecture, **first, values=values)
-        policy = Policy(network.init, network.apply, encoder=encoder)  # pyright: ignore[reportArgumentType]
+        policy = Policy(network.init, squashed.fix_unread(network.apply, numbers), encoder=encoder)  # pyright: ignore[reportArgumentType]
     else:
         head = {"hidden": trunk, "activation": activation, "dtype": dtype, "activate_last": True}
         policy = squashed.make(encoder, actor=actor, numbers=numbers, **head, **first)

@@ -1,7 +1,7 @@
 """Policies whose actions pass through tanh, for learners off policy: squashed Gaussians (SAC), deterministic ones (TD3), and critics.
 
-`Policy.apply` gives the deterministic action, tanh(mean), as what is evaluated. An action has 3 numbers, or the first 2 of them where the
-environment reads no more (`actions.numbers`); the third is then 0.
+`Policy.apply` gives the deterministic action, tanh(mean), as what is evaluated, and no deviation: `sample_action` draws under the tanh.
+An action has 3 numbers, or the first 2 of them where the environment reads no more (`actions.numbers`); the third is then 0.
 """
 
 import functools
@@ -16,6 +16,7 @@ from jaxtyping import Array, Float, PRNGKeyArray
 
 from scenefactory_jax.core.schema import ConfigError
 from scenefactory_jax.core.types import Observation, Policy
+from scenefactory_jax.learning import gaussian
 from scenefactory_jax.learning.networks.heads import MIN_STD, Encoder, Head, Network, make_critic, make_network, split_gaussian
 
 Actor = Literal["gaussian", "tanh_gaussian", "deterministic"]
@@ -78,10 +79,8 @@ def make(
         return split(network.apply(parameters, observation))
 
     def apply(parameters: Any, observation: Observation) -> tuple[Array, Array, Array]:
-        mean, std = distribution(parameters, observation)
-        action = jnp.tanh(mean)
-        log_std = jnp.log(std * (1.0 - action**2))  # of the squashed action, to first order; -inf without noise
-        return pad_action(action), pad_action(log_std, fill=-jnp.inf), jnp.zeros_like(action[..., 0])
+        action = pad_action(jnp.tanh(distribution(parameters, observation)[0]))
+        return action, jnp.full(FULL, -jnp.inf), jnp.zeros_like(action[..., 0])
 
     def encode(parameters: Any, critics: Any, observation: Observation) -> Float[Array, "3 *batch W"]:
         own, others = (tree["params"].get("encoder", {}) for tree in (parameters, critics))
@@ -96,9 +95,36 @@ def make(
     return Policy(network.init, apply, networks)  # pyright: ignore[reportArgumentType]
 
 
-def pad_action(action: Float[Array, "*batch D"], fill: float = 0.0) -> Float[Array, "*batch 3"]:
-    """Appends the numbers that the environment does not read."""
-    return jnp.pad(action, [(0, 0)] * (action.ndim - 1) + [(0, FULL - action.shape[-1])], constant_values=fill)
+def pad_action(action: Float[Array, "*batch D"]) -> Float[Array, "*batch 3"]:
+    """Appends zeros as the numbers that the environment does not read."""
+    return jnp.pad(action, [(0, 0)] * (action.ndim - 1) + [(0, FULL - action.shape[-1])])
+
+
+def sample_action(policy: Policy, parameters: Any, observation: Observation, key: PRNGKeyArray) -> Float[Array, "*batch 3"]:
+    """Samples actions of any policy: of a squashed Gaussian under its tanh, otherwise of the Gaussian that `apply` gives."""
+    if policy.networks is None:
+        mean, log_std, _ = policy.apply(parameters, observation)
+        return gaussian.sample(key, mean, log_std)
+    mean, std = policy.networks.distribution(parameters, observation)
+    return pad_action(jnp.tanh(gaussian.sample(key, mean, jnp.log(std))))
+
+
+def fix_unread(apply: Callable[..., Any], numbers: int) -> Callable[..., Any]:
+    """Makes those numbers of a Gaussian policy that the environment does not read standard normal, whatever the parameters: they would add
+    noise to the ratios of probabilities, and to the divergence, that PPO learns by.
+
+    Args:
+        apply: (parameters, observation) -> (mean, log_std, value).
+        numbers: of an action that are read.
+    """
+    if numbers == FULL:
+        return apply
+
+    def apply_fixed(parameters: Any, observation: Observation) -> tuple[Array, Array, Array]:
+        mean, log_std, value = apply(parameters, observation)
+        return mean.at[..., numbers:].set(0.0), log_std.at[numbers:].set(0.0), value
+
+    return apply_fixed
 
 
 def get_networks(policy: Policy, actors: Sequence[Actor], *, learner: str) -> Networks:
