@@ -381,7 +381,7 @@ class Env(NamedTuple):
 class Policy(NamedTuple):
     """`apply(parameters, observation) -> (mean [..., 3], log_std [3], value [...])` for any leading axes; several values: [..., values].
 
-    A deviation may depend on the observation: log_std [..., 3]. A logarithm of -inf is that of a policy without noise, as a planner.
+    A logarithm of -inf is that of a policy without noise, as a planner; actions of a squashed Gaussian are sampled from `networks`.
     """
 
     init: Callable[[PRNGKeyArray, Observation], Any]
