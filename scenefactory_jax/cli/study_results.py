@@ -131,8 +131,8 @@ def collect(plan: Plan, config: Mapping[str, Any], records: RowRecords) -> dict[
         "scenes": {name: scene or "the recipe's own" for name, scene in scenes.items()},
         "missing": [task.label for task in (*plan.trainings, *plan.evaluations) if not task.file.is_file()],
         "rows": [_summarise(key, runs, resampling) for key, runs in records.items() if runs],
-        "differences": _compare(study["compare"], records, resampling),
-        "drops": _compare_conditions(study["drops"], records, resampling),
+        "differences": _choose(_compare(study["compare"], records, resampling), study["metrics"]),
+        "drops": _choose(_compare_conditions(study["drops"], records, resampling), study["metrics"]),
         "trainings": {variant: _describe_trainings(variant, plan, config["target"]) for variant in study["trainings"]},
         "made_with": {"commit": run_config.find_commit(), **run_config.versions()},
     }
@@ -146,6 +146,13 @@ def _summarise(key: RowKey, runs: statistics.Runs, resampling: Mapping[str, int]
         "friction": float(np.mean([records["friction"].mean() for records in runs.values()])),
         "pooled": statistics.summarise_runs(runs, **resampling), "each": statistics.summarise_each_run(runs),
     }  # fmt: skip
+
+
+def _choose(changes: list[dict[str, Any]], metrics: list[str] | None) -> list[dict[str, Any]]:
+    """The differences of the study's own metrics, if it has any: those of all metrics, which nothing shows, are most of a large file."""
+    if metrics is None:
+        return changes
+    return [{**entry, "change": {name: entry["change"][name] for name in metrics if name in entry["change"]}} for entry in changes]
 
 
 def _compare(pairs: Iterable[list[str]], records: RowRecords, resampling: Mapping[str, int]) -> list[dict[str, Any]]:

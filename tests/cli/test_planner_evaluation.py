@@ -1,6 +1,7 @@
 """`evaluate` with planners alone: the table of planners x metrics, tables of agents, the page of failures, and the same bits every time."""
 
 import csv
+import io
 import json
 import re
 
@@ -19,6 +20,7 @@ from scenefactory_jax.data.loading import scene_source
 from scenefactory_jax.evaluation import episode_records, scoring
 from scenefactory_jax.evaluation.metrics.step_failures import COMPLIANCE, EVENTS
 from scenefactory_jax.evaluation.settings import ScoreSettings
+from scenefactory_jax.evaluation.statistics import Estimate
 from scenefactory_jax.visualization.report import planner_table
 
 SMALL = ["scenes=streets", "scenes.heldout.count=3", "dynamics=bicycle_waymax", "timing=waymax", "actions=acceleration"]
@@ -159,3 +161,12 @@ def test_another_compilation_gives_the_same_bits(plain):
     assert expected["vmax_score"].dtype == np.float32 and len(np.unique(expected["log_divergence_m"])) == 3
     for records in twice:
         assert_same_bits(records, expected)
+
+
+def test_metrics_below_zero_have_their_place():
+    """Stopping margins on ice: an axis that began at 0 had no width."""
+    estimate = Estimate(-30.0, -50.0, -10.0, 64, "m", "")
+    figure = planner_table.draw_panels(["a", "b"], [{"stopping_margin_m": estimate}, {}], ["stopping_margin_m"])
+    low, high = figure.axes[0].get_xlim()
+    assert low < -50.0 and 0.0 < high < 50.0 and all(text.get_position()[0] < high for text in figure.axes[0].texts)
+    figure.savefig(io.BytesIO())

@@ -105,14 +105,15 @@ def _draw_panel(axes: Axes, name: str, estimates: Sequence[Estimate | None]) -> 
     known = [(place, estimate) for place, estimate in enumerate(estimates) if estimate is not None and estimate.count]
     values, low, high = (scale * numbers for numbers in plots.intervals([estimate for _, estimate in known]))
     bound = 1.0 if METRICS[name].unit == "" else 100.0 if METRICS[name].rate else 0.0  # of scores and rates
-    top = max([bound, *high, 1e-9])
+    top, bottom = max([bound, *high, 0.0]), min([*low, 0.0])
+    span = max(top - bottom, 1e-9)
     places = np.array([place for place, _ in known], int)
     axes.barh(places, values, 0.7, color=[plots.COLOURS[place % len(plots.COLOURS)] for place in places], alpha=0.85)
     axes.errorbar(values, places, xerr=[values - low, high - values], fmt="none", ecolor="#222222", elinewidth=1.1, capsize=2.5)
     for place, value, end in zip(places, values, high, strict=True):
-        axes.text(end + 0.03 * top, place, f"{value:.2f}" if scale == 1.0 else f"{value:.1f}", va="center", fontsize=7.5)
+        axes.text(max(end, 0.0) + 0.03 * span, place, f"{value:.2f}" if scale == 1.0 else f"{value:.1f}", va="center", fontsize=7.5)
     for place in set(range(len(estimates))) - set(places.tolist()):
-        axes.text(0.03 * top, place, "absent", va="center", fontsize=7.5, color="#777777")
+        axes.text(0.03 * span, place, "absent", va="center", fontsize=7.5, color="#777777")
     unit = " (%)" if scale == 100.0 else f" ({METRICS[name].unit})" if METRICS[name].unit else ""
-    axes.set(title=METRICS[name].label + unit, xlim=(0, 1.35 * top))
+    axes.set(title=METRICS[name].label + unit, xlim=(1.05 * bottom, top + 0.35 * span))
     axes.grid(False, axis="y")
