@@ -189,8 +189,9 @@ def _loop(
 
     Of several processes the first one writes, and all end after the same iteration.
 
-    `minutes` counts iterations, compilation included, not checkpoints or evaluations. A signal ends the loop after the current iteration,
-    with a checkpoint.
+    `minutes` counts iterations, not checkpoints or evaluations, and not the first iteration of each process, which compiles: on a GPU 50 to
+    180 s, by learner, so that equal minutes are equal times of training. A signal ends the loop after the current iteration, with a
+    checkpoint.
 
     Args:
         first: iteration that the run resumes at; None: a new run.
@@ -207,7 +208,7 @@ def _loop(
             before = time.monotonic()
             state, worlds, row = step(trainer, state, worlds, streams, first=iteration == 1)
             seconds = time.monotonic() - before
-            spent += seconds / 60
+            spent += seconds / 60 if iteration > start + 1 else 0.0
             row = {"iteration": iteration, "minutes": spent, "steps/total": count_spawned_steps(state), **row, "seconds": seconds}
             row["casps"] = row["steps/spawned"] / seconds
             row |= count_years(row, years, control_hz=config["timing"]["control_hz"])

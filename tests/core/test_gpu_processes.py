@@ -7,6 +7,7 @@ import time
 
 import pytest
 
+from scenefactory_jax.core.instantiate import ConfigError
 from scenefactory_jax.core.parallel import gpu_processes
 
 
@@ -27,6 +28,10 @@ def failing(index, folder):
     if index == 1:
         raise ValueError("this one fails")
     (folder / "done").touch()
+
+
+def misconfigured(index):
+    raise ConfigError("worlds: expected an integer >= 1, got 0")
 
 
 def beating(index, folder):
@@ -63,6 +68,12 @@ def test_an_error_is_raised_after_all_processes_have_ended(tmp_path, capfd):
     with pytest.raises(RuntimeError, match="1 of 2 processes ended with an error"):
         gpu_processes.run_on_gpus(failing, 2, tmp_path)
     assert (tmp_path / "done").exists() and "this one fails" in capfd.readouterr().err
+
+
+def test_a_mistake_in_the_config_is_raised_and_not_printed(capfd):
+    with pytest.raises(ConfigError, match="worlds: expected an integer >= 1, got 0"):
+        gpu_processes.run_on_gpus(misconfigured, 2)
+    assert "Traceback" not in capfd.readouterr().err
 
 
 @pytest.mark.parametrize("how", [signal.SIGTERM, signal.SIGKILL])

@@ -10,6 +10,7 @@ from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any, NoReturn, TypeVar
 
+from scenefactory_jax.core.instantiate import ConfigError
 from scenefactory_jax.core.parallel.task_map import open_pool
 from scenefactory_jax.core.parallel.worker import FailedTask
 
@@ -46,8 +47,8 @@ def run_on_gpus(work: Callable[..., Any], processes: int, *arguments: Any, per_g
     """Computes `work(index, *arguments)` in each process.
 
     An error or SIGTERM in this process ends the others first (a training after its iteration, or after its last checkpoint where that takes
-    longer than `open_pool` waits), so that their results can be used; Ctrl-C reaches all processes of a terminal. Raises RuntimeError after
-    all have ended, if one ended with an error, which it has printed.
+    longer than `open_pool` waits), so that their results can be used; Ctrl-C reaches all processes of a terminal. Raises the ConfigError of
+    a process, and RuntimeError after all have ended, if one ended with another error, which it has printed.
 
     Args:
         per_gpu: processes that share a GPU and its memory: while one compiles on the CPU, the others compute.
@@ -66,6 +67,8 @@ def _run(index: int, *, work: Callable[..., Any], arguments: tuple[Any, ...]) ->
         os.sched_setaffinity(0, {cores[index % len(cores)]})
     try:
         return work(index, *arguments)
+    except ConfigError:  # is raised in this process, and printed there as one line
+        raise
     except Exception:
         traceback.print_exc()
         raise
