@@ -107,6 +107,8 @@ def test_metrics_have_a_row_an_iteration_and_a_column_a_term(whole):
     with open(whole.folder / "metrics.csv", newline="") as file:
         rows = [{name: float(value) for name, value in row.items()} for row in csv.DictReader(file)]
     assert rows == whole.metrics and [row["iteration"] for row in rows] == [1, 2, 3, 4]
+    minutes = np.cumsum([0.0] + [row["seconds"] / 60 for row in rows[1:]])  # not the first, which compiles
+    np.testing.assert_allclose([row["minutes"] for row in rows], minutes, rtol=1e-9)
     terms = {f"reward/{name}" for name in whole.config["reward"]}
     assert terms == {name for name in rows[0] if name.startswith("reward/")} and len(terms) == 10
     for row in rows:

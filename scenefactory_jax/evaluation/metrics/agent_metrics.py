@@ -100,7 +100,7 @@ METRICS: dict[str, Metric] = {
         "Route completion", FRACTION, "Part of the route between start and goal that an agent has been on; mean over the agents with a "
         "route.", _on_route("route_completion"), _has_completion, optional=True),
     "collisions_per_100_km": Metric(
-        "Collisions per 100 km", "1/100 km", "Agents with a route that had a collision, over the distance that all agents with a route "
+        "Collisions", "per 100 km", "Agents with a route that had a collision, over the distance that all agents with a route "
         "drove.", _column("collision"), _has_route, weight=lambda records: _on_route("driven_m")(records) / 1e5, optional=True),
     "red_light_rate": _rate(
         "Red lights run", "Agents whose front passed a stop line at a red light, of the agents with a route.", _column("red_light"),

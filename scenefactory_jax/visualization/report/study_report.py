@@ -179,8 +179,8 @@ def _trainings(result: Result) -> list[str]:
     header = ["", "Seed", "Scenes", "Iterations", "Agent steps", "Hours driven", "Minutes", "Steps/s", "Device", "Commit"]
     total = sum(run["minutes"] for trained in result["trainings"].values() for run in trained["runs"].values())
     text = (
-        f"{total:.0f} minutes of training in all. Minutes are those of iterations; the first run of a program compiles it in its first "
-        "iteration. Agent steps are control steps of spawned slots, hours those that they drove; of the steps a second, the median."
+        f"{total:.0f} minutes of training in all. Minutes are those of iterations, as `minutes` counts them. "
+        "Agent steps are control steps of spawned slots, hours those that they drove; of the steps a second, the median."
     )
     return [text, markdown.format_table(header, cells), _to_target(result)]
 
