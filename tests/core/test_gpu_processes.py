@@ -9,6 +9,7 @@ import pytest
 
 from scenefactory_jax.core.instantiate import ConfigError
 from scenefactory_jax.core.parallel import gpu_processes
+from scenefactory_jax.core.raw_scene import SceneError
 
 
 def work(index, pieces, folder):
@@ -30,8 +31,8 @@ def failing(index, folder):
     (folder / "done").touch()
 
 
-def misconfigured(index):
-    raise ConfigError("worlds: expected an integer >= 1, got 0")
+def mistaken(index, error):
+    raise error
 
 
 def beating(index, folder):
@@ -70,9 +71,10 @@ def test_an_error_is_raised_after_all_processes_have_ended(tmp_path, capfd):
     assert (tmp_path / "done").exists() and "this one fails" in capfd.readouterr().err
 
 
-def test_a_mistake_in_the_config_is_raised_and_not_printed(capfd):
-    with pytest.raises(ConfigError, match="worlds: expected an integer >= 1, got 0"):
-        gpu_processes.run_on_gpus(misconfigured, 2)
+@pytest.mark.parametrize("error", [ConfigError("worlds: expected an integer >= 1, got 0"), SceneError("no.bank: no such folder")])
+def test_a_mistake_of_the_user_is_raised_and_not_printed(error, capfd):
+    with pytest.raises(ConfigError, match=str(error)):
+        gpu_processes.run_on_gpus(mistaken, 2, error)
     assert "Traceback" not in capfd.readouterr().err
 
 

@@ -13,6 +13,7 @@ from typing import Any, NoReturn, TypeVar
 from scenefactory_jax.core.instantiate import ConfigError
 from scenefactory_jax.core.parallel.task_map import open_pool
 from scenefactory_jax.core.parallel.worker import FailedTask
+from scenefactory_jax.core.raw_scene import SceneError
 
 T = TypeVar("T")
 VISIBLE, MEMORY = "CUDA_VISIBLE_DEVICES", "XLA_PYTHON_CLIENT_MEM_FRACTION"
@@ -47,8 +48,9 @@ def run_on_gpus(work: Callable[..., Any], processes: int, *arguments: Any, per_g
     """Computes `work(index, *arguments)` in each process.
 
     An error or SIGTERM in this process ends the others first (a training after its iteration, or after its last checkpoint where that takes
-    longer than `open_pool` waits), so that their results can be used; Ctrl-C reaches all processes of a terminal. Raises the ConfigError of
-    a process, and RuntimeError after all have ended, if one ended with another error, which it has printed.
+    longer than `open_pool` waits), so that their results can be used; Ctrl-C reaches all processes of a terminal. Raises ConfigError
+    for a mistake in the config or scenes that cannot be used, and RuntimeError after all have ended, if one ended with another error, which
+    it has printed.
 
     Args:
         per_gpu: processes that share a GPU and its memory: while one compiles on the CPU, the others compute.
@@ -67,8 +69,8 @@ def _run(index: int, *, work: Callable[..., Any], arguments: tuple[Any, ...]) ->
         os.sched_setaffinity(0, {cores[index % len(cores)]})
     try:
         return work(index, *arguments)
-    except ConfigError:  # is raised in this process, and printed there as one line
-        raise
+    except (ConfigError, SceneError) as error:  # of the user's: the process that started this one raises it, and prints it as one line
+        raise ConfigError(str(error)) from error
     except Exception:
         traceback.print_exc()
         raise
