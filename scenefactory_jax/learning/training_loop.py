@@ -189,9 +189,8 @@ def _loop(
 
     Of several processes the first one writes, and all end after the same iteration.
 
-    `minutes` counts iterations, not checkpoints or evaluations, and not the first iteration of each process, which compiles: on a GPU 50 to
-    180 s, by learner, so that equal minutes are equal times of training. A signal ends the loop after the current iteration, with a
-    checkpoint.
+    `minutes` counts iterations, not checkpoints or evaluations, and not the first iteration of each process, which compiles, so that equal
+    minutes are equal times of training. A signal ends the loop after the current iteration, with a checkpoint.
 
     Args:
         first: iteration that the run resumes at; None: a new run.
