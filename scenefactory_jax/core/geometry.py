@@ -7,6 +7,7 @@ from jaxtyping import Array, Float, Int
 from scenefactory_jax.core.types import Road
 
 SMALLEST = 1e-6  # below this, squared speeds (m^2/s^2) and closing speeds (m/s) count as zero
+BLOCK = 128  # values that are compared in one step of `find_smallest`
 CONTIGUOUS_M = 0.05  # a lane's arc length may differ by this much from the summed segments before it counts as broken
 
 
@@ -64,6 +65,34 @@ def _(primals: tuple, tangents: tuple) -> tuple:
 def take_largest(values: Float[Array, "*n m"]) -> Float[Array, "*n"]:
     """Computes the largest value of the last axis, -inf without any, with the derivative of `take_smallest`."""
     return -take_smallest(-values)
+
+
+def find_smallest(values: Float[Array, "*n m"]) -> Int[Array, "*n"]:
+    """Finds the first place of the smallest value in the last axis, as `jnp.argmin`, in two steps: the block that has it, its place there.
+
+    On CPUs XLA vectorises the search for a smallest value, not that for its place.
+    """
+    count = values.shape[-1]
+    blocks = count // BLOCK
+    if blocks < 2:
+        return jnp.argmin(values, axis=-1).astype(jnp.int32)
+    rest = -count % BLOCK
+    padded = jnp.pad(values, [(0, 0)] * (values.ndim - 1) + [(0, rest)], constant_values=jnp.inf) if rest else values
+    block_values = padded.reshape(*values.shape[:-1], -1, BLOCK)
+    block = jnp.argmin(jnp.min(block_values, axis=-1), axis=-1).astype(jnp.int32)
+    chosen = jnp.take_along_axis(block_values, block[..., None, None], axis=-2)[..., 0, :]
+    return block * BLOCK + jnp.argmin(chosen, axis=-1).astype(jnp.int32)
+
+
+def squared_distances(point: Float[Array, "*n d"], points: Float[Array, "m d"]) -> Float[Array, "*n m"]:
+    """Computes the squared distances from each point to all of `points`.
+
+    An axis at a time: differences as vectors would put an axis of two or three innermost, over which no loop is vectorised.
+    """
+    total = (point[..., 0, None] - points[:, 0]) ** 2
+    for axis in range(1, points.shape[-1]):
+        total = total + (point[..., axis, None] - points[:, axis]) ** 2
+    return total
 
 
 def dot(a: Float[Array, "*n d"], b: Float[Array, "*m d"]) -> Float[Array, "*k"]:

@@ -141,7 +141,7 @@ def _make_driver(
     task = {**config, "spawning": spawning, "reward": rewards.hold_weights(config["reward"])}
     env, policy = environment.make_env(task), make_policy(config)
     control_hz, limit = float(config["timing"]["control_hz"]), environment.episode_steps(config["timing"])
-    chunk = -(-settings["chunk_steps"] // env.action_repeat) * env.action_repeat  # whole actions
+    chunk = -(-min(settings["chunk_steps"], limit) // env.action_repeat) * env.action_repeat  # whole actions
     thresholds = settings["failures"]
     limits = {"thresholds": SignalThresholds(**thresholds["signals"]), "course": CourseThresholds(**thresholds["course"])}
     hook = episodes.make_hook(env, ttc_limit_s=settings["ttc_limit_s"], control_dt=1 / control_hz, **limits)

@@ -1,7 +1,7 @@
 """Failures by type: the first thing that went wrong for every agent without a clean success, and the worst of each type.
 
-Every such agent has one type; other things that are true of it are flags. An event (collision, road edge, crash, simulation fault) comes
-first, and the first event counts. Without an event the earliest of wrong way, overshoot and stuck counts.
+Every such agent has one type; other things that are true of it are flags. An event (collision, road edge, crash, red light, stop sign, off
+route, simulation fault) comes first, and the first event counts. Without an event the earliest of wrong way, overshoot and stuck counts.
 """
 
 from collections import Counter
@@ -40,6 +40,13 @@ FAILURE_TYPES: dict[str, FailureType] = {
         "closing speed", "m/s"),
     "edge": FailureType("road edge", "the first event is a contact with a road edge.", "speed at the edge", "m/s"),
     "crash": FailureType("crash", "the first event is that it tipped over, or left the map or its surroundings.", "speed before", "m/s"),
+    "red_light": FailureType(
+        "red light", "the first event is that its front passed a stop line while the light was red.", "speed at the line", "m/s"),
+    "stop_sign": FailureType(
+        "stop sign", "the first event is that its front passed the line of a stop sign without having stood before it.",
+        "speed at the line", "m/s"),
+    "off_route": FailureType(
+        "off route", "the first event is that it was farther from its route than the step metrics allow.", "speed before", "m/s"),
     "wrong_way": FailureType(
         "wrong way", "no event; it drove a stretch of `wrong_way_m` against the direction of every lane within `lane_m` of it.",
         "longest stretch against the lanes", "m"),
@@ -53,7 +60,10 @@ FAILURE_TYPES: dict[str, FailureType] = {
 FLAGS = {
     "at_fault": "at fault in a collision", "wrong_way": "wrong way", "overshoot": "overshoot", "stuck": "stuck", "goal_reached": "arrived",
 }  # fmt: skip
-EVENT_TYPES = {"numerical_error": "numerical_error", "out_of_bounds": "crash", "road_edge_contact": "edge"}
+EVENT_TYPES = {  # of events that one type each stands for; a collision has two
+    "numerical_error": "numerical_error", "out_of_bounds": "crash", "road_edge_contact": "edge",
+    "red_light": "red_light", "stop_sign": "stop_sign", "off_route": "off_route",
+}  # fmt: skip
 SIGNALS = (  # columns of records that hold what the types are derived from
     "wrong_way", "first_event", "event_s", "event_mps", "collision_partner", "approach_mps", "partner_approach_mps",
     "collision_wrong_way", "partner_wrong_way", "closest_m", "closest_s", "departure_m", "rest_s", "wrong_way_m", "wrong_way_fraction",

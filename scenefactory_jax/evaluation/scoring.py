@@ -37,7 +37,7 @@ EVEN_S = 1e-3  # by which a time step may differ
 COUNTED = "counted"  # whether a state counts, beside the failures of metrics
 AT_START_M = 0.01  # a car this near to its start began there
 PATHS = 10  # of an agent that are read, its best ones
-WORLDS_AT_ONCE = 4  # on the device; memory grows with them
+AGENTS_AT_ONCE = 64  # on the device; memory grows with them
 
 
 class Start(NamedTuple):
@@ -52,7 +52,7 @@ class Start(NamedTuple):
 class Scores(NamedTuple):
     """Scores of all worlds, on the host."""
 
-    values: dict[str, np.ndarray]  # metric -> [W, A], NaN where it cannot be computed
+    values: dict[str, np.ndarray]  # metric -> [W, A], NaN where it cannot be computed and of slots without an agent
     failures: dict[str, np.ndarray]  # metric -> whether it fails after each control step, [W, T, A], of the recorded worlds; and COUNTED
 
 
@@ -72,18 +72,30 @@ def make_scorer(
     """
     control_hz, mass = float(config["timing"]["control_hz"]), float(config["dynamics"]["contact"]["mass"])
     stride, surrogates = find_stride(1 / control_hz), schema.read(config["step_metrics"], StepMetricsConfig, where="step_metrics")
-    score = make_program(dataclasses.replace(settings, noise=None), surrogates, mass, recorded_worlds)
+    score = make_program(dataclasses.replace(settings, noise=None), surrogates, mass)
 
     def score_all(scene: Scene, start: Start, frames: EpisodeFrame) -> Scores:
         thinned = jax.tree.map(lambda leaf: leaf[:, stride - 1 :: stride], frames)
-        worlds = replace(scene, road_grid=None)
-        values, failures = jax.device_get(score(worlds, start, thinned, describe_lanes(scene)))
+        present = np.asarray(start.agents.present)
+        world, agent = np.nonzero(present)
+        values, failures = score(replace(scene, road_grid=None), start, thinned, describe_lanes(scene), world, agent)
+        columns = {name: spread_agents(np.asarray(column), present, np.nan) for name, column in values.items()}
+        recorded = present[:recorded_worlds]
+        rows = {name: jax.device_get(mask[: np.sum(recorded)]) for name, mask in failures.items()}  # not of all worlds
+        masks = {name: np.swapaxes(spread_agents(mask, recorded, False), 1, 2) for name, mask in rows.items()}
         step = np.arange(frames.active.shape[1])
         held = np.maximum(step - (stride - 1), 0) // stride  # a failure lasts from its state until the next one
-        marks = {name: mask[:, held] & (step >= stride - 1)[:, None] for name, mask in failures.items()}
-        return Scores(values, marks | {COUNTED: failures[COUNTED][:, step // stride]})
+        marks = {name: mask[:, held] & (step >= stride - 1)[:, None] for name, mask in masks.items()}
+        return Scores(columns, marks | {COUNTED: masks[COUNTED][:, step // stride]})
 
     return score_all
+
+
+def spread_agents(rows: np.ndarray, present: Bool[np.ndarray, "W A"], absent: float | bool) -> np.ndarray:
+    """Puts the rows of all present agents in the places of their slots; those of other slots are `absent`."""
+    spread = np.full((*present.shape, *rows.shape[1:]), absent, rows.dtype)
+    spread[present] = rows
+    return spread
 
 
 class LaneFacts(NamedTuple):
@@ -105,14 +117,20 @@ def describe_lanes(scene: Scene) -> LaneFacts:
 
 
 @functools.lru_cache(maxsize=4)  # all planners of an evaluation have one program
-def make_program(settings: ScoreSettings, surrogates: StepMetricsConfig, mass: float, recorded_worlds: int) -> Callable[..., Any]:
-    """Makes the compiled function (scenes, starts, frames, lanes' facts) -> values and failures of `score_world`, for all worlds."""
+def make_program(settings: ScoreSettings, surrogates: StepMetricsConfig, mass: float) -> Callable[..., Any]:
+    """Makes the compiled function (scenes, starts, frames, lanes' facts, worlds, agents) -> results of `score_agent`, for each pair of a
+    world and a slot: slots without an agent cost nothing."""
 
     @jax.jit
-    def score(scene: Scene, start: Start, frames: EpisodeFrame, facts: LaneFacts) -> tuple[dict[str, Array], dict[str, Array]]:
-        score_one = functools.partial(score_world, settings=settings, surrogates=surrogates, mass=mass)
-        values, failures = jax.lax.map(lambda world: score_one(*world), (scene, start, frames, facts), batch_size=WORLDS_AT_ONCE)
-        return values, {name: mask[:recorded_worlds] for name, mask in failures.items()}
+    def score(
+        scene: Scene, start: Start, frames: EpisodeFrame, facts: LaneFacts, world: Int[Array, " N"], agent: Int[Array, " N"]
+    ) -> tuple[dict[str, Array], dict[str, Array]]:
+        def score_one(pair: tuple[Array, Array]) -> tuple[dict[str, Array], dict[str, Array]]:
+            of = lambda worlds: jax.tree.map(lambda leaf: leaf[pair[0]], worlds)  # noqa: E731
+            one = of(scene), of(start), of(frames), of(facts), pair[1]
+            return score_agent(*one, settings=settings, surrogates=surrogates, mass=mass)
+
+        return jax.lax.map(score_one, (world, agent), batch_size=AGENTS_AT_ONCE)
 
     return score
 
@@ -138,54 +156,48 @@ def find_speed_limits(scene: Scene) -> tuple[np.ndarray, np.ndarray]:
     return limit, limit > 0
 
 
-def score_world(
+def score_agent(
     scene: Scene,
     start: Start,
     frames: EpisodeFrame,
     lane_facts: LaneFacts,
+    agent: Int[Array, ""],
     *,
     settings: ScoreSettings,
     surrogates: StepMetricsConfig,
     mass: float,
-) -> tuple[dict[str, Float[Array, " A"]], dict[str, Bool[Array, "T A"]]]:
-    """Computes the metrics and scores of all agents of one world, NaN where one cannot be computed; and where metrics fail in its frames.
+) -> tuple[dict[str, Float[Array, ""]], dict[str, Bool[Array, " T"]]]:
+    """Computes the metrics and scores of an agent of a world, NaN where one cannot be computed; and where metrics fail in its frames.
 
     Args:
         mass: of the agents' cars, kg.
     """
     past_rows = settings.past_rows
     users, log = collect_users(scene, start, frames, past_rows=past_rows), read_log(scene, past_rows, len(frames.active))
-    lanes, edges = list_lane_points(scene, lane_facts), list_edge_points(scene.edges)
     time = STEP_S * jnp.arange(-past_rows, len(frames.active) + 1, dtype=jnp.float32)
-    lights = Lights(scene.controls.lane, jax.vmap(lambda at: read_light_states(scene.controls, at))(time))
     counted = jnp.arange(users.yaw.shape[1]) > past_rows
-    use = jnp.pad(frames.friction_utilization, ((past_rows + 1, 0), (0, 0)))
     masses = find_masses(start, own=mass, vehicle_kg_per_m2=settings.vehicle_kg_per_m2)
-
-    def score_agent(agent: Int[Array, ""]) -> tuple[dict[str, Array], dict[str, Array]]:
-        record = EpisodeRecord(
-            ego=read_track(users, agent),
-            size=users.size[agent],
-            counted=counted & users.valid[agent],
-            others=leave_out(users, agent),
-            lanes=lanes,
-            edges=edges,
-            paths=list_paths(scene, agent),
-            lights=lights,
-            log=jax.tree.map(lambda leaf: leaf[agent], log),
-            friction_utilization=use[:, agent],
-            mass=masses[agent],
-            other_mass=masses,
-        )
-        steps = measure_steps(record, dt=STEP_S, surrogates=surrogates)
-        record = record._replace(counted=cut_at_failure(record, steps)) if settings.ends_at_failure else record
-        metrics = episode_metrics.collect_metrics(record, steps, dt=STEP_S, max_lateral_m=settings.max_lateral_m)
-        failures = find_failures(record, steps, metrics, dt=STEP_S) | {COUNTED: record.counted}
-        values = metrics | episode_scores.compute_scores(metrics)
-        values = {name: jnp.where(valid, value, jnp.nan) for name, (value, valid) in values.items()}
-        return values, {name: mask[past_rows + 1 :] for name, mask in failures.items()}
-
-    return jax.vmap(score_agent, out_axes=(0, 1))(jnp.arange(len(start.agents.yaw)))
+    record = EpisodeRecord(
+        ego=read_track(users, agent),
+        size=users.size[agent],
+        counted=counted & users.valid[agent],
+        others=leave_out(users, agent),
+        lanes=list_lane_points(scene, lane_facts),
+        edges=list_edge_points(scene.edges),
+        paths=list_paths(scene, agent),
+        lights=Lights(scene.controls.lane, jax.vmap(lambda at: read_light_states(scene.controls, at))(time)),
+        log=jax.tree.map(lambda leaf: leaf[agent], log),
+        friction_utilization=jnp.pad(frames.friction_utilization[:, agent], (past_rows + 1, 0)),
+        mass=masses[agent],
+        other_mass=masses,
+    )
+    steps = measure_steps(record, dt=STEP_S, surrogates=surrogates)
+    record = record._replace(counted=cut_at_failure(record, steps)) if settings.ends_at_failure else record
+    metrics = episode_metrics.collect_metrics(record, steps, dt=STEP_S, max_lateral_m=settings.max_lateral_m)
+    failures = find_failures(record, steps, metrics, dt=STEP_S) | {COUNTED: record.counted}
+    values = metrics | episode_scores.compute_scores(metrics)
+    values = {name: jnp.where(valid, value, jnp.nan) for name, (value, valid) in values.items()}
+    return values, {name: mask[past_rows + 1 :] for name, mask in failures.items()}
 
 
 def find_masses(start: Start, *, own: float, vehicle_kg_per_m2: float) -> Float[Array, " U"]:

@@ -11,7 +11,18 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from scenefactory_jax.core.geometry import SMALLEST, cross, dot, heading_vector, safe_sqrt, take_largest, take_smallest, to_frame
+from scenefactory_jax.core.geometry import (
+    SMALLEST,
+    cross,
+    dot,
+    find_smallest,
+    heading_vector,
+    safe_sqrt,
+    squared_distances,
+    take_largest,
+    take_smallest,
+    to_frame,
+)
 from scenefactory_jax.core.pallas import on_gpu
 from scenefactory_jax.core.types import Road, Scene, SetObservation, SpatialGrid
 from scenefactory_jax.roadgraph import road_kernels, spatial_grid
@@ -53,8 +64,7 @@ def query_road(
 
 def nearest_lane(position: Float[Array, "A 2"], lanes: Road) -> Int[Array, " A"]:
     """Row of the valid segment whose midpoint is nearest; of equal distances the first in storage order."""
-    offset = position[:, None, :] - lanes.midpoint
-    return jnp.argmin(jnp.where(lanes.valid, dot(offset, offset), jnp.inf), axis=1).astype(jnp.int32)
+    return find_smallest(jnp.where(lanes.valid, squared_distances(position, lanes.midpoint), jnp.inf))
 
 
 def squared_edge_distance(circles: Float[Array, "A C 2"], edges: Road, *, half_width_m: float) -> Float[Array, " A"]:

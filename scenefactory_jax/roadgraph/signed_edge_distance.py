@@ -5,7 +5,7 @@ from typing import NamedTuple
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from scenefactory_jax.core.geometry import cross, dot, safe_norm
+from scenefactory_jax.core.geometry import cross, dot, find_smallest, safe_norm, squared_distances
 from scenefactory_jax.core.types import Road
 
 
@@ -69,8 +69,8 @@ def compute_line_distance(point: Float[Array, "*n d"], edges: EdgePoints, *, hei
 
 def _find_nearest(point: Float[Array, "*n d"], edges: EdgePoints, *, height_scale: float) -> Int[Array, "*n"]:
     scale = jnp.array([1.0, 1.0, height_scale][: point.shape[-1]], jnp.float32)
-    apart = (point[..., None, :] - edges.position[:, : point.shape[-1]]) * scale
-    return jnp.argmin(jnp.where(edges.valid, dot(apart, apart), jnp.inf), axis=-1)
+    squared = squared_distances(point * scale, edges.position[:, : point.shape[-1]] * scale)
+    return find_smallest(jnp.where(edges.valid, squared, jnp.inf))
 
 
 def _find_neighbour(row: Int[Array, "*n"], step: int, edges: EdgePoints) -> Int[Array, "*n"]:

@@ -77,6 +77,7 @@ DRIVES = {
     "late": (drive(-30, speed=2), (50, 0), AWAY),
 }
 NAMES = list(DRIVES)
+RULES = ("red_light", "stop_sign", "off_route")  # the road of the drives has no lights, no signs and no routes
 
 
 def scripted(first, goal, second):
@@ -154,11 +155,28 @@ def test_a_scripted_drive_has_its_type(played, name, agent, kind):
 
 def test_every_failure_has_one_type(played):
     records, _ = played
-    assert set(records["failure"]) == {*failures.FAILURE_TYPES, failures.NONE}
+    kinds = [kind for kind in failures.FAILURE_TYPES if kind not in RULES]
+    assert set(records["failure"]) == {*kinds, failures.NONE}
     np.testing.assert_array_equal(records["failure"] == failures.NONE, records["clean"])
     found = failures.rank_failures(records)
     rows = [failure.row for ranked in found.values() for failure in ranked]
-    assert sorted(rows) == np.flatnonzero(~records["clean"]).tolist() and list(found) == list(failures.FAILURE_TYPES)
+    assert sorted(rows) == np.flatnonzero(~records["clean"]).tolist() and list(found) == kinds
+
+
+def test_every_event_has_a_type(played):
+    """An agent that runs a red light and arrives has failed by the red light; it is not out of time."""
+    records, _ = played
+    columns = {name: records[name] for name in ("goal_reached", "collision", "clean", "end_distance_m", *failures.SIGNALS)}
+    moments = ("event", "closest", "last_rest", "first_wrong_way", "end")
+    columns |= {f"{moment}_{axis}": np.zeros(len(records["clean"])) for moment in moments for axis in ("s", "x_m", "y_m")}
+    row, names = row_of(records, "arrives"), failure_signals.FAILURE_EVENTS
+    signals = {name: np.repeat(column[row], len(names)) for name, column in columns.items()}
+    signals |= {"first_event": np.array(names), "event_s": np.arange(1.0, len(names) + 1), "clean": np.zeros(len(names), bool)}
+    thresholds = failures.TypeThresholds(at_fault_speed_fraction=0.3, at_fault_min_mps=0.5, stuck_s=5.0, departure_m=3.0)
+    found = failures.classify(signals, thresholds)
+    kinds = dict(zip(names, found["failure"], strict=True))
+    assert kinds == failures.EVENT_TYPES | {"collision": "struck"} and set(RULES) <= set(kinds)
+    np.testing.assert_array_equal(found["failure_s"], signals["event_s"])
 
 
 def test_moments_places_and_severities(played):

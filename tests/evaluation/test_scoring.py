@@ -119,6 +119,13 @@ def test_failures_are_marked_from_the_state_in_which_they_happen():
     assert not failures["off_road"].any()
 
 
+def test_scores_are_in_the_slots_of_their_agents():
+    present = np.array([[False, True, False], [True, False, True]])
+    spread = scoring.spread_agents(np.array([[1.0, 2.0], [3.0, 4.0], [5.0, 6.0]]), present, np.nan)
+    np.testing.assert_array_equal(spread[present], [[1, 2], [3, 4], [5, 6]])
+    assert np.isnan(spread[~present]).all() and scoring.spread_agents(np.zeros((3, 1), bool), present, False).dtype == bool
+
+
 def test_road_users_have_masses():
     start = episode()[1]
     assert scores()[0]["delta_v_mps"][0] == SPEED / 2  # between two equal cars

@@ -9,7 +9,7 @@ from typing import NamedTuple
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from scenefactory_jax.core.geometry import dot, heading_vector, safe_norm, to_frame, wrap_angle
+from scenefactory_jax.core.geometry import dot, find_smallest, heading_vector, safe_norm, to_frame, wrap_angle
 from scenefactory_jax.core.savitzky_golay import filter_range
 from scenefactory_jax.env.planning_metrics import compute_time_to_overlap, find_ahead, find_behind
 from scenefactory_jax.evaluation.metrics import waymax_steps
@@ -56,8 +56,8 @@ def measure_outside(position: Float[Array, "d"], yaw: Float[Array, ""], size: Fl
 def find_lane_direction(position: Float[Array, "d"], yaw: Float[Array, ""], lanes: Lanes) -> Float[Array, "2"]:
     """Finds the direction of the lane on which a car is, of several the nearest of its own direction; zero beside lanes."""
     squared = measure_lane_distances(position, lanes)
-    own = jnp.argmin(jnp.where(dot(lanes.direction, heading_vector(yaw)) >= 0, squared, jnp.inf))
-    nearest = jnp.argmin(squared)
+    own = find_smallest(jnp.where(dot(lanes.direction, heading_vector(yaw)) >= 0, squared, jnp.inf))
+    nearest = find_smallest(squared)
     is_on = lambda row: lanes.valid[row] & (safe_norm(position[:2] - lanes.position[row, :2]) <= waymax_steps.HALF_LANE_M)  # noqa: E731
     follows = is_on(own) & (dot(lanes.direction[own], heading_vector(yaw)) >= 0)
     row = jnp.where(follows, own, nearest)

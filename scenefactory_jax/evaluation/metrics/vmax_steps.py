@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from scenefactory_jax.core.boxes import find_overlaps
-from scenefactory_jax.core.geometry import cross, dot, heading_vector, safe_norm
+from scenefactory_jax.core.geometry import cross, dot, find_smallest, heading_vector, safe_norm, squared_distances
 from scenefactory_jax.core.types import LANE_FREEWAY
 from scenefactory_jax.env.planning_metrics import find_behind
 from scenefactory_jax.evaluation.metrics.episode_record import CYCLIST, PEDESTRIAN, Lanes
@@ -82,12 +82,12 @@ def locate_on_lanes(position: Float[Array, "d"], yaw: Float[Array, ""], size: Fl
     """
     corners = place_corners(position, yaw, size)
     across = lambda row: jnp.abs(cross(lanes.direction[row], corners[:, :2] - lanes.position[row, :2]))  # noqa: E731
-    nearest = jnp.argmin(measure_lane_distances(position, lanes))
+    nearest = find_smallest(measure_lane_distances(position, lanes))
     aligned = dot(lanes.direction, heading_vector(yaw)) >= 0
     squared = measure_lane_distances(corners, lanes)
 
     def measure_nearest(chosen: Bool[Array, " P"]) -> Float[Array, "4"]:
-        distance = across(jnp.argmin(jnp.where(chosen, squared, jnp.inf), axis=1))
+        distance = across(find_smallest(jnp.where(chosen, squared, jnp.inf)))
         return jnp.where(jnp.any(chosen & lanes.valid), distance, jnp.inf)
 
     oncoming = jnp.any(measure_nearest(aligned) > OFF_LANE_M) & jnp.all(measure_nearest(~aligned) < OFF_LANE_M)
@@ -96,10 +96,8 @@ def locate_on_lanes(position: Float[Array, "d"], yaw: Float[Array, ""], size: Fl
 
 def measure_lane_distances(point: Float[Array, "*n d"], lanes: Lanes) -> Float[Array, "*n P"]:
     """Computes the squared distances to points of lanes, heights stretched; inf where a point is not valid."""
-    apart = point[..., None, :] - lanes.position
-    squared = dot(apart, apart)
-    if point.shape[-1] == 3:
-        squared = squared + (HEIGHT_SCALE**2 - 1.0) * apart[..., 2] ** 2
+    scale = jnp.array([1.0, 1.0, HEIGHT_SCALE][: point.shape[-1]], jnp.float32)
+    squared = squared_distances(point * scale, lanes.position * scale)
     return jnp.where(lanes.valid, squared, jnp.inf)
 
 
