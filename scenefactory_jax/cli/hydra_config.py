@@ -74,7 +74,7 @@ def load_config(name: str = "train", *overrides: str) -> dict[str, Any]:
     Raises:
         ConfigError: an unknown config, key or option, with the valid ones.
     """
-    return to_dict(_open(name, overrides))
+    return _open(name, overrides)[1]
 
 
 def load_with_choices(name: str, *overrides: str) -> tuple[dict[str, Any], dict[str, Any]]:
@@ -83,7 +83,7 @@ def load_with_choices(name: str, *overrides: str) -> tuple[dict[str, Any], dict[
     Raises:
         ConfigError: see `load_config`.
     """
-    opened = _open(name, overrides, whole=True)
+    opened, _ = _open(name, overrides, whole=True)
     choices = {group: chosen for group, chosen in opened.hydra.runtime.choices.items() if not group.startswith("hydra/")}
     del opened.hydra
     return OmegaConf.to_container(opened, resolve=True), choices  # pyright: ignore[reportReturnType]
@@ -95,7 +95,7 @@ def load_each(name: str, *overrides: str, key: str, values: Sequence[Any]) -> li
     Raises:
         ConfigError: see `load_config`.
     """
-    opened = _open(name, overrides)
+    opened, _ = _open(name, overrides)
     found = []
     for value in values:
         OmegaConf.update(opened, key, value)
@@ -103,13 +103,15 @@ def load_each(name: str, *overrides: str, key: str, values: Sequence[Any]) -> li
     return found
 
 
-def _open(name: str, overrides: Sequence[str], *, whole: bool = False) -> Any:
-    """Composes a config without resolving references; `whole`: with Hydra's own part and missing values; errors as of `load_config`."""
+def _open(name: str, overrides: Sequence[str], *, whole: bool = False) -> tuple[Any, dict[str, Any]]:
+    """Composes a config; returns it without and with resolved references.
+
+    `whole`: with Hydra's own part and missing values, and nothing resolved; errors as of `load_config`.
+    """
     find_config(name)
     try:
         opened = _compose(name, overrides, whole=whole)
-        if not whole:
-            to_dict(opened)
+        resolved = {} if whole else to_dict(opened)
     except MissingMandatoryValue as error:
         raise ConfigError(f"{error.full_key}: missing; give {error.full_key}=..., as `{name} --help` describes it") from None
     except (ConfigCompositionException, HydraException, OmegaConfBaseException) as error:
@@ -117,7 +119,7 @@ def _open(name: str, overrides: Sequence[str], *, whole: bool = False) -> Any:
     except ValueError as error:  # what Hydra says of `timing=null`
         raise ConfigError(f"{' '.join(overrides)}: {error}") from None
     _check_emptied(opened, overrides)
-    return opened
+    return opened, resolved
 
 
 def _check_emptied(opened: Any, overrides: Sequence[str]) -> None:
