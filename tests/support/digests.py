@@ -148,8 +148,8 @@ def evaluation() -> Any:
     config, settings = sf.load_config("train", *SMALL, "timing.episode_s=4"), sf.load_config("evaluate", "run=none")
     config["termination"] = sf.load_config("task", "termination=goal_only")["termination"]
     play = make_episode_runner(config, scenes(), settings=settings, worlds=0)
-    env = sf.make(config)
-    observation = env.reset(jax.random.key(0), scenes()[0])[1]
+    shapes = jax.eval_shape(sf.make(config).reset, jax.random.key(0), scenes()[0])[1]  # of the values, parameters do not know
+    observation = jax.tree.map(lambda leaf: jax.device_put(np.zeros(leaf.shape, leaf.dtype)), shapes)
     return play(make_policy(config).init(jax.random.key(0), observation))[0]
 
 
