@@ -183,6 +183,7 @@ def test_each_car_drives_as_in_the_c_engine_and_nothing_is_compiled_anew():
     assert several()[1]._cache_size() == before == 1
 
 
+@pytest.mark.slow  # a car of the fleet is the reference one: it drives as in the C engine, and test_dynamics has that of the car alone
 def test_a_fleet_of_the_same_drives_like_the_car():
     """Factors of 1: the numbers of the fitted model instead of the compiled one's, and nothing else."""
     from support.driving import drive as drive_same
@@ -363,6 +364,7 @@ def test_a_run_can_be_amended_with_a_fleet():
     assert config["dynamics"]["randomization"] is None
 
 
+@pytest.mark.slow  # sizes by hand are tested above, sizes in files by the packing's tests
 def test_sizes_of_real_scenes_build_and_step(shared_data):
     """Cars as large as the recording says, from its scenes to a second of driving."""
     scenes = load_config("convert", "scenes=womd", "scenes.pack.car_size_m=null")["scenes"]

@@ -23,8 +23,9 @@ NOISE = SCORES.noise
 
 def test_actions_are_those_of_v_max():
     """0.6 of 6 m/s^2; 0.3 1/m x 0.4 of a car that stands, x 0.03 from 40 km/h on; three quarters and a tenth of the others are strong."""
-    speed = jnp.repeat(jnp.array([0.0, 20 / 3.6, 40 / 3.6, 30.0]), DRAWS)
-    push, bend = (np.asarray(part).reshape(4, DRAWS) for part in noisy_start.draw_action(jax.random.key(0), speed, NOISE))
+    speed = np.repeat(np.float32([0.0, 20 / 3.6, 40 / 3.6, 30.0]), DRAWS)
+    drawn = jax.jit(lambda key, speed: noisy_start.draw_action(key, speed, NOISE))(jax.random.key(0), speed)
+    push, bend = (np.asarray(part).reshape(4, DRAWS) for part in drawn)
     bounds = 0.3 * np.array([0.4, 0.215, 0.03, 0.03])
     for size in (np.abs(push) / 3.6, np.abs(bend) / bounds[:, None]):
         assert 0.99 < size.max() < 1.001
@@ -50,10 +51,16 @@ def log_scene(wall_m=50.0, *, start=True):
     return replace(scene, log=log, edges=road_of(edges))
 
 
+@jax.jit
+def perturb(keys, scenes):
+    return noisy_start.perturb_starts(keys, scenes, NOISE, past_rows=ROWS)
+
+
 @functools.cache
 def perturbed(wall_m=50.0, start=True):
-    scenes = jax.tree.map(lambda leaf: jnp.stack([jnp.asarray(leaf)] * WORLDS), log_scene(wall_m, start=start))
-    return scenes, noisy_start.perturb_starts(jax.random.split(jax.random.key(1), WORLDS), scenes, NOISE, past_rows=ROWS)
+    scenes = jax.device_put(jax.tree.map(lambda leaf: np.stack([np.asarray(leaf)] * WORLDS), log_scene(wall_m, start=start)))
+    keys = jax.random.split(jax.random.key(1), WORLDS)
+    return scenes, jax.device_get(perturb(keys, scenes))
 
 
 def test_a_held_action_leads_to_the_start():

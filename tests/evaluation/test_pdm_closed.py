@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from support.hand_scenes import column_of
 from support.planning_scenes import state_of
 from support.route_scenes import routed_scene
 
@@ -222,14 +223,16 @@ def test_edges_rule_out_the_paths_that_touch_them(score):
 def test_comfort_and_direction_have_nuplans_bounds(settings):
     numbers = schema.read(settings["policy"]["scores"], ScoreConfig)
     steps = 41
-    push = jnp.array([[1.0] * steps, [3.0] * steps])
-    zero = jnp.zeros((2, steps))
-    car = pdm_simulation.Car(jnp.zeros((2, steps, 2)), zero, 5.0 + jnp.cumsum(push, axis=1) * 0.1, push, zero)
-    np.testing.assert_array_equal(pdm_scoring.check_comfort(car, numbers.comfort, dt_s=0.1), [1.0, 0.0])
-    lanes = NearSegments(*(jnp.array(column) for column in ([[0.0, 0.0]], [[-1.0, 0.0]], [50.0], [True])))
-    centre = jnp.tile(jnp.array([[[0.0, 1.0]], [[0.0, 0.0]], [[0.0, 0.0]], [[0.0, 2.0]]]), (1, 21, 1))
-    cars = pdm_simulation.Car(centre, jnp.zeros((4, 21)), jnp.array([[1.5], [3.0], [7.0], [7.0]]) * jnp.ones(21), *[jnp.zeros((4, 21))] * 2)
-    found = pdm_scoring.check_direction(lanes, cars, centre, numbers, dt_s=0.2)
+    push = np.float32([[1.0] * steps, [3.0] * steps])
+    zero = np.zeros((2, steps), np.float32)
+    car = pdm_simulation.Car(*map(column_of, (np.zeros((2, steps, 2)), zero, 5.0 + np.cumsum(push, axis=1) * 0.1, push, zero)))
+    comfort = jax.jit(lambda car: pdm_scoring.check_comfort(car, numbers.comfort, dt_s=0.1))(car)
+    np.testing.assert_array_equal(comfort, [1.0, 0.0])
+    lanes = NearSegments(*map(column_of, ([[0.0, 0.0]], [[-1.0, 0.0]], [50.0])), column_of([True], bool))
+    centre = column_of(np.tile([[[0.0, 1.0]], [[0.0, 0.0]], [[0.0, 0.0]], [[0.0, 2.0]]], (1, 21, 1)))
+    still = column_of(np.zeros((4, 21)))
+    cars = pdm_simulation.Car(centre, still, column_of(np.tile([[1.5], [3.0], [7.0], [7.0]], 21)), still, still)
+    found = jax.jit(lambda lanes, cars, centre: pdm_scoring.check_direction(lanes, cars, centre, numbers, dt_s=0.2))(lanes, cars, centre)
     np.testing.assert_array_equal(found, [1.0, 0.5, 0.0, 1.0])  # the last one is not on the lane
 
 
