@@ -1,10 +1,12 @@
 """The shape of the code: which package imports which, no circles, and how long a file and a function may be."""
 
 import ast
+import functools
 import re
 from collections import defaultdict
 from graphlib import TopologicalSorter
 from pathlib import Path
+from typing import NamedTuple
 
 from support.running import ROOT
 
@@ -21,10 +23,28 @@ ON_DEVICE += tuple(f"learning/{part}" for part in ("ppo", "sac", "td3", "bc", "a
 HOST_ONLY = {"os", "pathlib", "time", "logging", "matplotlib", "shutil", "datetime"}
 
 
+class Source(NamedTuple):
+    """What the tests read of a file."""
+
+    imports: list[ast.Import | ast.ImportFrom]  # at its top and in functions
+    functions: list[tuple[int, int, str]]  # first line, last line, name
+    prints: bool
+    lines: int
+
+
+@functools.cache
+def read(path: Path) -> Source:
+    text = path.read_text()
+    nodes = list(ast.walk(ast.parse(text)))
+    functions = [(n.lineno, n.end_lineno, n.name) for n in nodes if isinstance(n, (ast.FunctionDef, ast.AsyncFunctionDef))]
+    prints = any(isinstance(n, ast.Call) and getattr(n.func, "id", "") == "print" for n in nodes)
+    return Source([n for n in nodes if isinstance(n, (ast.Import, ast.ImportFrom))], functions, prints, len(text.splitlines()))
+
+
 def imported_modules(path: Path) -> set[str]:
     """Modules of the package that a file imports, at its top or in a function, as dotted names without the package's own."""
     found = set()
-    for node in ast.walk(ast.parse(path.read_text())):
+    for node in read(path).imports:
         if isinstance(node, ast.ImportFrom) and node.module and node.module.partition(".")[0] == PACKAGE.name:
             base = node.module.partition(".")[2]
             names = {f"{base}.{alias.name}".lstrip(".") for alias in node.names}
@@ -45,10 +65,10 @@ def module_of(path: Path) -> str:
 
 def libraries(path: Path) -> set[str]:
     names = set()
-    for node in ast.walk(ast.parse(path.read_text())):
+    for node in read(path).imports:
         if isinstance(node, ast.Import):
             names |= {alias.name.partition(".")[0] for alias in node.names}
-        elif isinstance(node, ast.ImportFrom) and node.module:
+        elif node.module:
             names.add(node.module.partition(".")[0])
     return names
 
@@ -81,8 +101,7 @@ def test_only_commands_use_hydra_and_print():
         if path.relative_to(PACKAGE).parts[0] in ("cli", "__main__.py") or path == SCRIPT:
             continue
         assert not libraries(path) & {"hydra", "omegaconf"}, path
-        calls = [n for n in ast.walk(ast.parse(path.read_text())) if isinstance(n, ast.Call) and getattr(n.func, "id", "") == "print"]
-        assert not calls, f"{path} prints"
+        assert not read(path).prints, f"{path} prints"
 
 
 def test_what_runs_on_the_device_stays_off_the_host():
@@ -93,11 +112,9 @@ def test_what_runs_on_the_device_stays_off_the_host():
 
 def test_files_and_functions_stay_short():
     for path in FILES:
-        text = path.read_text()
-        assert len(text.splitlines()) <= 400, path
-        for node in ast.walk(ast.parse(text)):
-            if isinstance(node, (ast.FunctionDef, ast.AsyncFunctionDef)):
-                assert node.end_lineno - node.lineno < 66, f"{path}:{node.lineno} {node.name} is too long"
+        assert read(path).lines <= 400, path
+        for first, last, name in read(path).functions:
+            assert last - first < 66, f"{path}:{first} {name} is too long"
 
 
 def test_sources_are_ones_that_a_user_has():
