@@ -28,6 +28,7 @@ pytestmark = pytest.mark.usefixtures("quickly")
 
 STUDIES = sorted(path.stem for path in (hydra_config.find_conf() / "study").glob("*.yaml") if path.stem != "base")
 BASE = ["experiment=smoke", "worlds=2", "scenes.count=2", "scenes.heldout.count=2"]
+BASE += ["~observations.road", "~observations.neighbours"]  # less to compile
 TOY = {
     "base": [*BASE, "observations.ego._target_=support.study_parts.ego"],
     "common": ["evaluation.every=1"],
