@@ -127,7 +127,6 @@ def test_falls_of_a_noisy_start(plain, tmp_path, capsys):
             compare(hydra_config.load_config("compare", f"evaluations={words}", f"out={tmp_path}"))
 
 
-@pytest.mark.slow  # an evaluation repeats another's records in test_train and in test_wosac_protocol
 def test_the_same_seed_gives_the_same_bits(plain, tmp_path):
     with quick_compilation():
         again = evaluate(asked(tmp_path, "planners=[random]")).records["whole, random"]

@@ -364,7 +364,6 @@ def test_a_run_can_be_amended_with_a_fleet():
     assert config["dynamics"]["randomization"] is None
 
 
-@pytest.mark.slow  # sizes by hand are tested above, sizes in files by the packing's tests
 def test_sizes_of_real_scenes_build_and_step(shared_data):
     """Cars as large as the recording says, from its scenes to a second of driving."""
     scenes = load_config("convert", "scenes=womd", "scenes.pack.car_size_m=null")["scenes"]
