@@ -72,9 +72,8 @@ def find_smallest(values: Float[Array, "*n m"]) -> Int[Array, "*n"]:
 
     On CPUs XLA vectorises the search for a smallest value, not that for its place.
     """
-    count = values.shape[-1]
-    blocks = count // BLOCK
-    if blocks < 2:
+    values, count = jax.lax.stop_gradient(values), values.shape[-1]  # a place has no derivative
+    if count < 2 * BLOCK:
         return jnp.argmin(values, axis=-1).astype(jnp.int32)
     rest = -count % BLOCK
     padded = jnp.pad(values, [(0, 0)] * (values.ndim - 1) + [(0, rest)], constant_values=jnp.inf) if rest else values
