@@ -52,6 +52,17 @@ def test_values_read_back_as_they_were():
     assert {f"scenes.pack.{key}": pack[key] for key in ("agents", "scene_size_m", "centre", "car_size_m")} == settings
 
 
+@pytest.mark.parametrize("protocol", ["vmax", "nuplan", "scenarionet", "recorded", "route100"])
+@pytest.mark.parametrize("experiment", ["vmax", "scenarionet"])
+def test_no_start_or_goal_is_out_of_bounds(experiment, protocol):
+    """Cars end where the square ends in which starts and goals lie, in training and in every protocol."""
+    trained = hydra_config.load_config("train", f"experiment={experiment}")
+    for config in (trained, hydra_config.apply_overrides(trained, overrides_of(protocol))):
+        assert config["step_metrics"]["scene_size_m"] == config["scenes"]["pack"]["scene_size_m"]
+    narrow = hydra_config.load_config("train", f"experiment={experiment}", "scenes.pack.scene_size_m=150")
+    assert narrow["step_metrics"]["scene_size_m"] == 150
+
+
 def test_one_setting_changes_on_the_command_line():
     assert "weather=wet" in overrides_of("recorded", "protocol.settings.weather=wet")
 
