@@ -83,14 +83,17 @@ def find_smallest(values: Float[Array, "*n m"]) -> Int[Array, "*n"]:
     return block * BLOCK + jnp.argmin(chosen, axis=-1).astype(jnp.int32)
 
 
-def squared_distances(point: Float[Array, "*n d"], points: Float[Array, "m d"]) -> Float[Array, "*n m"]:
+def squared_distances(point: Float[Array, "*n d"], points: Float[Array, "m d"], *, height_scale: float = 1.0) -> Float[Array, "*n m"]:
     """Computes the squared distances from each point to all of `points`.
 
     An axis at a time: differences as vectors would put an axis of two or three innermost, over which no loop is vectorised.
+
+    Args:
+        height_scale: by which differences of heights (d = 3) are stretched.
     """
-    total = (point[..., 0, None] - points[:, 0]) ** 2
-    for axis in range(1, points.shape[-1]):
-        total = total + (point[..., axis, None] - points[:, axis]) ** 2
+    total = (point[..., 0, None] - points[:, 0]) ** 2 + (point[..., 1, None] - points[:, 1]) ** 2
+    if points.shape[-1] == 3:
+        total = total + (height_scale * (point[..., 2, None] - points[:, 2])) ** 2
     return total
 
 

@@ -68,8 +68,7 @@ def compute_line_distance(point: Float[Array, "*n d"], edges: EdgePoints, *, hei
 
 
 def _find_nearest(point: Float[Array, "*n d"], edges: EdgePoints, *, height_scale: float) -> Int[Array, "*n"]:
-    scale = jnp.array([1.0, 1.0, height_scale][: point.shape[-1]], jnp.float32)
-    squared = squared_distances(point * scale, edges.position[:, : point.shape[-1]] * scale)
+    squared = squared_distances(point, edges.position[:, : point.shape[-1]], height_scale=height_scale)
     return find_smallest(jnp.where(edges.valid, squared, jnp.inf))
 
 

@@ -25,7 +25,6 @@ def test_a_shared_composition_is_hydras(words, monkeypatch, tmp_path):
     monkeypatch.setattr(composing.ConfigRepository, "load_config", composing.load_config)
     monkeypatch.setattr(composing.defaults_list, "_create_interpolation_map", composing.map_choices)
     monkeypatch.setattr(composing.Box, "_re_parent", composing.set_parents)
-    monkeypatch.setattr(composing.ConfigLoaderImpl, "_embed_result_config", staticmethod(composing.embed))
     expected = composing.compose(name, overrides)
     shared, expected = hydra_config.to_dict(shared), hydra_config.to_dict(expected)
     assert shared == expected and repr(shared) == repr(expected)  # in the same order

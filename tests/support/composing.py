@@ -5,7 +5,6 @@ values are applied after all groups, by Hydra's own function. Other processes an
 of the user's (`hydra.searchpath`), sweeps and Hydra's own part of a config are composed as ever.
 """
 
-import copy
 import functools
 import hashlib
 import os
@@ -18,13 +17,12 @@ from hydra._internal import defaults_list
 from hydra._internal.config_loader_impl import ConfigLoaderImpl
 from hydra._internal.config_repository import ConfigRepository
 from hydra.core.override_parser.overrides_parser import OverridesParser
-from omegaconf import OmegaConf, flag_override
 from omegaconf.base import Box
 
 from scenefactory_jax.cli import hydra_config
 
 compose, load_config, map_choices = hydra_config._compose, ConfigRepository.load_config, defaults_list._create_interpolation_map
-set_parents, embed = Box._re_parent, ConfigLoaderImpl._embed_result_config
+set_parents = Box._re_parent
 FILES, GROUPS = {}, {}  # pickled: what is handed out is a copy
 FOLDER = Path(os.environ["JAX_COMPILATION_CACHE_DIR"])  # `support.compiler` removes what has not been read for a week
 
@@ -39,32 +37,7 @@ def read_once(self, config_path):
     key = file, config_path, source.provider, stat.st_mtime_ns, stat.st_size, stat.st_ino
     if key not in FILES:
         FILES[key] = pickle.dumps(load_config(self, config_path))
-    return unpickle(FILES[key])
-
-
-def unpickle(pickled):
-    """A file's result that nobody else has, which knows what it was read from."""
-    result = pickle.loads(pickled)
-    result.pickled = pickled
-    return result
-
-
-def embed_without_copy(result, package):
-    """In place of `ConfigLoaderImpl._embed_result_config`, which copies a config into its package: here it is put there itself.
-
-    A composition may use one file in several packages: what is in one already is read again for the next.
-    """
-    place = result.header["package"] if package is None else package
-    if not hasattr(result, "pickled"):  # Hydra's own, of no file
-        return embed(result, package)
-    own = unpickle(result.pickled) if hasattr(result, "used") else copy.copy(result)
-    result.used = True
-    if place:
-        whole = OmegaConf.create()
-        with flag_override(whole, "no_deepcopy_set_nodes", True):
-            OmegaConf.update(whole, place, own.config, merge=False)
-        own.config = whole
-    return own
+    return pickle.loads(FILES[key])
 
 
 def map_choices_if_read(overrides, defaults, self_added):
@@ -128,4 +101,3 @@ def share():
     yaml.SafeLoader = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
     ConfigRepository.load_config, hydra_config._compose = read_once, compose_once
     defaults_list._create_interpolation_map, Box._re_parent = map_choices_if_read, set_new_parents
-    ConfigLoaderImpl._embed_result_config = staticmethod(embed_without_copy)

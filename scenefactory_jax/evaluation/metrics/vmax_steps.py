@@ -96,9 +96,7 @@ def locate_on_lanes(position: Float[Array, "d"], yaw: Float[Array, ""], size: Fl
 
 def measure_lane_distances(point: Float[Array, "*n d"], lanes: Lanes) -> Float[Array, "*n P"]:
     """Computes the squared distances to points of lanes, heights stretched; inf where a point is not valid."""
-    scale = jnp.array([1.0, 1.0, HEIGHT_SCALE][: point.shape[-1]], jnp.float32)
-    squared = squared_distances(point * scale, lanes.position * scale)
-    return jnp.where(lanes.valid, squared, jnp.inf)
+    return jnp.where(lanes.valid, squared_distances(point, lanes.position, height_scale=HEIGHT_SCALE), jnp.inf)
 
 
 def estimate_speed_limit(kind: Int[Array, "*n"], log_top_speed: Float[Array, ""]) -> Float[Array, "*n"]:
