@@ -41,6 +41,17 @@ def test_who_has_a_route(street):
     assert set(log.route[log.has_route].tolist()) == {1, 2}
 
 
+@pytest.mark.parametrize(("sdc", "track", "routes"), [(0, 7, 1), (2, 9, 1), (3, 10, 0)])
+def test_the_recording_car_is_the_agent_also_where_it_stands(street, sdc, track, routes):
+    numbers = {"agents": 1, "min_travel_m": 0.0, "centre": "sdc", "routes": {**ROUTES, "drawn": 0}}
+    scene, report = prepared(replace(street, sdc=sdc), **numbers)
+    agents = scene.agents
+    assert report.track_ids == (track,) and (scene.routes.agent == 0).sum() == routes
+    assert (agents.route_end[0] > agents.route_start[0]) == (routes > 0), "a route leads on from where it waits; none from the kerb"
+    if sdc:
+        assert agents.goal[0] == pytest.approx([0.0, 0.0]) and agents.route_end[0] - agents.route_start[0] == pytest.approx(routes)
+
+
 def test_a_route_is_the_lane_from_the_first_place_on(street):
     scene, report = packed(street)
     first = street.tracks[0].xyz[0, :2] - np.array(report.centre[:2])

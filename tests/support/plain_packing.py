@@ -223,7 +223,7 @@ def _objection(track, current, origin, half, min_travel_m):
         return "start_outside_box"
     if np.abs(goal).max() > half:
         return "goal_outside_box"
-    return "too_short" if np.hypot(*(goal - start)) <= min_travel_m else None
+    return "too_short" if np.hypot(*(goal - start)) < min_travel_m else None
 
 
 def _last(track):

@@ -271,7 +271,7 @@ def _choose_agents(
         "absent_at_start": ~logs.valid[:, current],
         "start_outside_box": np.abs(start).max(axis=1) > half,
         "goal_outside_box": np.abs(goal).max(axis=1) > half,
-        "too_short": np.hypot(*(goal - start).T) <= min_travel_m,
+        "too_short": np.hypot(*(goal - start).T) < min_travel_m,
         "no_conflict": ~allowed,
     }
     dropped, candidates = dict.fromkeys(DROPS, 0), np.ones(len(tracks), bool)

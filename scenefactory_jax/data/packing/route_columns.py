@@ -88,9 +88,9 @@ def pack_routes(
     vehicles = [index for index in traffic if config.traffic and raw.tracks[index].kind == "vehicle"]
     for slot, index in [*enumerate(agents), *((-1, index) for index in vehicles)]:
         if slot < 0 and not _is_moving(raw, logs, index, config.min_travel_m):
-            options = _find_waiting_route(lanes, raw, logs, index, config, half=half)
+            options = _find_waiting_routes(lanes, raw, logs, index, config, count=1, half=half)
         else:
-            options = _find_routes(lanes, logs, index, config, count=config.alternatives if slot >= 0 else 1, half=half)
+            options = _find_routes(lanes, raw, logs, index, config, count=config.alternatives if slot >= 0 else 1, half=half)
         first[index], routed[index] = len(found), bool(options)
         found += options
         owner += [slot] * len(options)
@@ -134,31 +134,37 @@ def _is_moving(raw: RawScene, logs: Logs, index: int, min_travel_m: float) -> bo
     return bool(len(path) > 1 and np.linalg.norm(path - path[0], axis=1).max() > min_travel_m)
 
 
-def _find_routes(lanes: LaneMap, logs: Logs, index: int, config: RouteConfig, *, count: int, half: float) -> list[SampledRoute]:
-    """The routes of a track within the square; none for a track that does not move."""
+def _find_routes(
+    lanes: LaneMap, raw: RawScene, logs: Logs, index: int, config: RouteConfig, *, count: int, half: float
+) -> list[SampledRoute]:
+    """The routes of a track within the square; those of a track that does not move lead on from where it waits."""
     valid = logs.valid[index]
     track, yaw = logs.xyz[index, valid, :2], float(logs.yaw[index, valid][0])
     if len(track) < 2 or np.linalg.norm(track - track[0], axis=1).max() < ROUTE_SPACING_M:
-        return []
+        return _find_waiting_routes(lanes, raw, logs, index, config, count=count, half=half)
     options = route_sets.find_track_routes(
         lanes, track, yaw, count=count, max_length_m=config.length_m, max_distance_m=config.max_distance_m
     )
-    cut = [route_sets.cut_to_square(route, np.zeros(2), half) for route in options]
-    return [route for route in cut if route is not None]
+    return _cut(options, half)
 
 
-def _find_waiting_route(
-    lanes: LaneMap, raw: RawScene, logs: Logs, index: int, config: RouteConfig, *, half: float
+def _find_waiting_routes(
+    lanes: LaneMap, raw: RawScene, logs: Logs, index: int, config: RouteConfig, *, count: int, half: float
 ) -> list[SampledRoute]:
-    """The route of a vehicle that stands on a lane: it waits, at a light or in a queue, and has somewhere to go; none for a parked one."""
+    """Routes of a vehicle that stands on a lane: it waits, at a light or in a queue, and has somewhere to go; none for a parked one."""
     if not logs.valid[index, raw.current]:
         return []
     place, yaw = logs.xyz[index, raw.current, :2], float(logs.yaw[index, raw.current])
     ahead = place + ROUTE_SPACING_M * np.array([np.cos(yaw), np.sin(yaw)])
     numbers = {"max_length_m": config.length_m, "max_distance_m": config.waiting_m}
-    (route, *_) = route_sets.find_track_routes(lanes, np.stack([place, ahead]), yaw, count=1, **numbers)
-    cut = route_sets.cut_to_square(route, np.zeros(2), half) if route.along_lanes else None
-    return [] if cut is None else [cut]
+    options = route_sets.find_track_routes(lanes, np.stack([place, ahead]), yaw, count=count, **numbers)
+    return _cut([route for route in options if route.along_lanes], half)
+
+
+def _cut(routes: Sequence[SampledRoute], half: float) -> list[SampledRoute]:
+    """The parts of routes within the square."""
+    cut = [route_sets.cut_to_square(route, np.zeros(2), half) for route in routes]
+    return [route for route in cut if route is not None]
 
 
 def _assemble(
@@ -267,7 +273,10 @@ def _measure(line: _Line, points: Float[np.ndarray, "*L 2"]) -> tuple[Float[np.n
 def _place_agents(
     columns: Mapping[str, np.ndarray], raw: RawScene, logs: Logs, agents: Sequence[int], first: np.ndarray, routed: np.ndarray, slots: int
 ) -> dict[str, np.ndarray]:
-    """Route, start and end of each agent: its places on the route at the current step and at the end of its log."""
+    """Route, start and end of each agent: its places on the route at the current step and at the end of its log.
+
+    Routes that do not lead on are none (`types.Agents`): the way of a car that stands is one spacing long.
+    """
     route, start, end = np.zeros(slots, int), np.zeros(slots), np.zeros(slots)
     for slot, index in enumerate(agents):
         if not routed[index]:
@@ -276,7 +285,7 @@ def _place_agents(
         line = _make_line(columns["routes.position"][route[slot]])
         path = logs.xyz[index, raw.current :][logs.valid[index, raw.current :], :2]
         start[slot] = _project(line, path[0])[0]
-        end[slot] = _follow(line, path, start[slot])
+        end[slot] = _follow(line, path, start[slot]) if _is_moving(raw, logs, index, ROUTE_SPACING_M) else start[slot] + ROUTE_SPACING_M
     return {"agents.route": route, "agents.route_start": start, "agents.route_end": end}
 
 
