@@ -191,6 +191,15 @@ def _count_flags(failures: list[Failure]) -> dict[str, int]:
     return {name: counts[name] for name in FLAGS if name in counts}
 
 
+def count_incomplete(records: Records) -> dict[str, int]:
+    """Counts clean successes that are no clean completion of their route, and those of them that missed a gate; none: nothing."""
+    if "clean_completion" not in records:  # another program's, without routes
+        return {}
+    incomplete = np.asarray(records["clean"], bool) & records["has_route"] & ~np.asarray(records["clean_completion"], bool)
+    counts = {"no clean completion": incomplete.sum(), "missed a gate": (incomplete & (records["missed_gates"] > 0)).sum()}
+    return {name: int(count) for name, count in counts.items() if count}
+
+
 def as_json(records: Records) -> dict[str, Any]:
     """Returns counts, scenes and the ranked failures of an evaluation, for a file."""
     agents = len(records["scene"])
@@ -205,20 +214,22 @@ def as_json(records: Records) -> dict[str, Any]:
         }
         for kind, failures in rank_failures(records).items()
     }
-    return {"agents": agents, "clean": int(np.sum(records["clean"])), "types": types}
+    return {"agents": agents, "clean": int(np.sum(records["clean"])), "incomplete": count_incomplete(records), "types": types}
 
 
 def format_table(records: Records, *, max_scenes: int = 3) -> str:
     """Formats a Markdown table: a row a type, with counts, fractions of all agents, flags, and the scenes that have most of it."""
     agents, clean = len(records["scene"]), np.asarray(records["clean"], bool)
     wrong_way = int(np.sum(clean & np.asarray(records["wrong_way"], bool)))
-    rows = [["clean success", clean.sum(), {"wrong_way": wrong_way} if wrong_way else {}, ""]]
+    also = ({FLAGS["wrong_way"]: wrong_way} if wrong_way else {}) | count_incomplete(records)
+    rows = [("clean success", int(clean.sum()), also, "")]
     for kind, failures in rank_failures(records).items():
         scenes = ", ".join(f"{scene} ({count})" for scene, count in count_by_scene(failures)[:max_scenes])
-        rows.append([FAILURE_TYPES[kind].label, len(failures), _count_flags(failures), scenes])
+        also = {FLAGS[name]: number for name, number in _count_flags(failures).items()}
+        rows.append((FAILURE_TYPES[kind].label, len(failures), also, scenes))
     cells = [
-        [label, count, f"{100 * count / agents:.1f} %", ", ".join(f"{FLAGS[name]} {number}" for name, number in flags.items()), scenes]
-        for label, count, flags, scenes in rows
+        [label, count, f"{100 * count / agents:.1f} %", ", ".join(f"{name} {number}" for name, number in also.items()), scenes]
+        for label, count, also, scenes in rows
     ]
     return markdown.format_table(["First failure", "Agents", f"Of {agents}", "Of these also", "Scenes with most"], cells)
 

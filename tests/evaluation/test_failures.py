@@ -240,6 +240,19 @@ def test_records_keep_failure_types_in_a_file(played, tmp_path):
         failures.rank_failures({name: column for name, column in records.items() if name != "severity"})
 
 
+def test_clean_successes_without_a_clean_completion_are_counted(played):
+    records, _ = played
+    routed = np.ones(len(records["clean"]), bool)
+    numbers = {"has_route": routed, "clean_completion": records["clean"], "missed_gates": np.zeros(len(routed), int)}
+    assert records["clean"].sum() == 1 and failures.count_incomplete(records | numbers) == {}
+    numbers["clean_completion"] = ~routed
+    assert failures.count_incomplete(records | numbers) == {"no clean completion": 1}
+    numbers["missed_gates"] = numbers["missed_gates"] + 3
+    assert failures.count_incomplete(records | numbers) == {"no clean completion": 1, "missed a gate": 1}
+    assert "no clean completion 1, missed a gate 1 |" in failures.format_table(records | numbers)
+    assert failures.count_incomplete(records | numbers | {"has_route": ~routed}) == {}
+
+
 def test_definitions_name_the_numbers(played, settings):
     text = failures.format_definitions(played[0], failures.list_thresholds(settings["failures"]))
     assert "`" not in text and "a stretch of 15 m" in text and "at least 33 % of the closing speed" in text
