@@ -451,8 +451,8 @@ def steps_of(config):
 
 
 TIMED = {"vmax": "vmax", "plants": "vmax", "scenarionet": "scenarionet", "curriculum": "scenarionet"}  # study -> its protocol
-TIMED |= {"learners": "route100", "vmax_scenes": "vmax"}
-MANY = ("curriculum", "plants")  # environments
+TIMED |= {"learners": "route100", "drive_rewards": "route100", "vmax_scenes": "vmax"}
+MANY = ("curriculum", "plants", "drive_rewards")  # environments
 STREAMED = "recipe_drive"  # trains on a mixture of banks and generated scenes
 WHOLE = [name for name in STUDIES if name not in (*TIMED, STREAMED)]
 TWINS = {"rewards_laptop", "network_laptop"}  # nearly the same variants as another study, for a CPU
@@ -474,7 +474,7 @@ def test_every_row_of_a_study_of_equal_time_builds(name, tmp_path):
         training_loop.prepare(one.config)
     for one in {one.program: one for one in plan.evaluations}.values():
         environment.make_parts(one.config)
-        assert (one.scores is None) == (name == "learners")
+        assert (one.scores is None) == (TIMED[name] == "route100")
     kinds = {one.program: actor_of(one) for one in plan.evaluations if one.weights == study_plan.TRAINED}
     assert all(actor_of(one) == kinds.get(one.program) for one in plan.evaluations if one.program in kinds)
     assert not set(entry["study"]["planners"]) - {one.row for one in plan.evaluations}
