@@ -97,6 +97,20 @@ def test_route100_keeps_away_from_standing_vehicles(place, taken):
     assert agents["agents.present"].any() == taken
 
 
+@pytest.mark.parametrize(
+    ("speed", "end", "braking", "taken"),
+    [(15.0, (0.0, 0.0), 4.0, False), (6.0, (0.0, 0.0), 4.0, True), (15.0, (0.0, 3.5), 4.0, True), (15.0, (0.0, 0.0), None, True)],
+    ids=["too fast", "able to stop", "in the next lane", "as before"],
+)
+def test_route100_leaves_out_starts_before_which_nobody_can_stop(speed, end, braking, taken):
+    columns = columns_of([road(150)], traffic=[(-20.0, 0.0)])
+    columns["traffic_log.velocity"][0, :, 0] = speed
+    columns["traffic_log.position"][0, 2] = end
+    numbers = entry("route100") | {"winding_fraction": 0.0, "reaction_s": 0.5, "braking_mps2": braking}
+    agents = drawn_starts.draw_agents(columns, numbers, row=1, slots=8, car_size_m=[4.0, 2.0])
+    assert agents["agents.present"].any() == taken
+
+
 # ---- grip
 
 

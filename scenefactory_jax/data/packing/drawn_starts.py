@@ -43,10 +43,14 @@ def route100(
     winding_fraction: Fraction,
     standing_m: NonNegative,
     clearance_m: NonNegative,
+    reaction_s: NonNegative,
+    braking_mps2: Positive | None,
+    car_size_m: list[float],
 ) -> Starts:
     """Chooses drawn routes of a length, from rest, with a part or more that turns, starts apart from each other and from road users.
 
-    Routes that a standing vehicle blocks are left out: within the gates of the suite no car can pass it.
+    Routes that a standing vehicle blocks are left out: within the gates of the suite no car can pass it. So are starts before which a road
+    user that comes along its logged way could not stop: no car could get out of its way from rest.
 
     Args:
         columns: of the scene: its routes, its traffic, and `row`, the row of its log at the start.
@@ -54,12 +58,17 @@ def route100(
         start_gap_m: between starts; the outlines of road users are half of it away, or more.
         standing_m: a vehicle that moves less in its log stands.
         clearance_m: between the line of a route and the outline of a standing vehicle: half a car and a margin.
+        reaction_s, braking_mps2: with which a road user stops; null: starts are taken whoever comes.
         winding_fraction: smallest part of routes that turn by 45 degrees or are 1.15 times longer than their chord.
     """
     rows = np.flatnonzero(columns["routes.drawn"] & (columns["routes.length"] >= length_m[0]))
     length = np.minimum(columns["routes.length"][rows], length_m[1])
     lines = [columns["routes.position"][row, : int(end / ROUTE_SPACING_M) + 1] for row, end in zip(rows, length, strict=True)]
-    free = [place for place, line in enumerate(lines) if not _is_blocked(line, columns, standing_m, clearance_m)]
+    come = _measure_arrivals(columns, reaction_s, braking_mps2)
+    free = [
+        place for place, line in enumerate(lines)
+        if not _is_blocked(line, columns, standing_m, clearance_m) and not _is_run_into(line, columns, come, car_size_m)
+    ]  # fmt: skip
     rows, length, lines = rows[free], length[free], [lines[place] for place in free]
     winding = np.array([route_sets.is_winding(line) for line in lines], bool)
     chosen: list[int] = []
@@ -201,6 +210,30 @@ def _is_blocked(line: Float[np.ndarray, "N 2"], columns: Mapping[str, np.ndarray
     moved = np.where(valid, np.hypot(*(position - first[:, None]).transpose(2, 0, 1)), 0.0).max(axis=1, initial=0.0)
     stands = valid[:, row] & (columns["traffic_log.kind"] == ROAD_USERS.index("vehicle")) & (moved < standing_m)
     return bool((_measure_distances(line, columns, stands) < clearance_m).any())
+
+
+def _measure_arrivals(columns: Mapping[str, np.ndarray], reaction_s: float, braking_mps2: float | None) -> Bool[np.ndarray, "K T"]:
+    """Whether each road user, at its logged speed at the start, cannot stop with its front before its place in each step from then on."""
+    row, valid = int(columns["row"]), columns["traffic_log.valid"]
+    if braking_mps2 is None:
+        return np.zeros_like(valid[:, row:])
+    path, speed = columns["traffic_log.position"][:, row:], np.hypot(*columns["traffic_log.velocity"][:, row].T)
+    step = np.hypot(*np.diff(path, axis=1, prepend=path[:, :1]).transpose(2, 0, 1))
+    room = np.cumsum(step * valid[:, row:], axis=1) - columns["traffic_log.size"][:, :1] / 2
+    needed = reaction_s * speed + speed**2 / (2.0 * braking_mps2)
+    return valid[:, row:] & valid[:, row : row + 1] & (speed > 0)[:, None] & (room < needed[:, None])
+
+
+def _is_run_into(
+    line: Float[np.ndarray, "N 2"], columns: Mapping[str, np.ndarray], come: Bool[np.ndarray, "K T"], car_size_m: list[float]
+) -> bool:
+    """Whether a road user touches a car at the beginning of a line at a place before which it cannot stop (`come`)."""
+    place, yaw = _point_at(line, 0.0)
+    users, steps = np.nonzero(come)
+    offset = columns["traffic_log.position"][users, int(columns["row"]) + steps] - place
+    along = np.abs(np.cos(yaw) * offset[:, 0] + np.sin(yaw) * offset[:, 1]) - car_size_m[0] / 2
+    across = np.abs(np.cos(yaw) * offset[:, 1] - np.sin(yaw) * offset[:, 0]) - car_size_m[1] / 2
+    return bool((np.hypot(np.maximum(along, 0.0), np.maximum(across, 0.0)) <= columns["traffic_log.size"][users, 1] / 2).any())
 
 
 def _measure_distances(points: Float[np.ndarray, "N 2"], columns: Mapping[str, np.ndarray], users: np.ndarray) -> Float[np.ndarray, "N K"]:
