@@ -58,16 +58,17 @@ def route100(
         start_gap_m: between starts; the outlines of road users are half of it away, or more.
         standing_m: a vehicle that moves less in its log stands.
         clearance_m: between the line of a route and the outline of a standing vehicle: half a car and a margin.
-        reaction_s, braking_mps2: with which a road user stops; null: starts are taken whoever comes.
+        reaction_s: after which a road user that comes brakes.
+        braking_mps2: its deceleration; None: no start is left out for it.
         winding_fraction: smallest part of routes that turn by 45 degrees or are 1.15 times longer than their chord.
     """
     rows = np.flatnonzero(columns["routes.drawn"] & (columns["routes.length"] >= length_m[0]))
     length = np.minimum(columns["routes.length"][rows], length_m[1])
     lines = [columns["routes.position"][row, : int(end / ROUTE_SPACING_M) + 1] for row, end in zip(rows, length, strict=True)]
-    come = _measure_arrivals(columns, reaction_s, braking_mps2)
+    come = _list_arrivals(columns, reaction_s, braking_mps2)
     free = [
         place for place, line in enumerate(lines)
-        if not _is_blocked(line, columns, standing_m, clearance_m) and not _is_run_into(line, columns, come, car_size_m)
+        if not _is_blocked(line, columns, standing_m, clearance_m) and not _is_run_into(line, come, car_size_m)
     ]  # fmt: skip
     rows, length, lines = rows[free], length[free], [lines[place] for place in free]
     winding = np.array([route_sets.is_winding(line) for line in lines], bool)
@@ -212,38 +213,47 @@ def _is_blocked(line: Float[np.ndarray, "N 2"], columns: Mapping[str, np.ndarray
     return bool((_measure_distances(line, columns, stands) < clearance_m).any())
 
 
-def _measure_arrivals(columns: Mapping[str, np.ndarray], reaction_s: float, braking_mps2: float | None) -> Bool[np.ndarray, "K T"]:
-    """Whether each road user, at its logged speed at the start, cannot stop with its front before its place in each step from then on."""
-    row, valid = int(columns["row"]), columns["traffic_log.valid"]
+class _Arrivals(NamedTuple):
+    """Logged places of road users before which they cannot stop."""
+
+    place: Float[np.ndarray, "N 2"]
+    half_width: Float[np.ndarray, " N"]
+
+
+def _list_arrivals(columns: Mapping[str, np.ndarray], reaction_s: float, braking_mps2: float | None) -> _Arrivals:
+    """Lists the places that the fronts of road users reach before these have braked from their logged speeds at the start."""
     if braking_mps2 is None:
-        return np.zeros_like(valid[:, row:])
-    path, speed = columns["traffic_log.position"][:, row:], np.hypot(*columns["traffic_log.velocity"][:, row].T)
+        return _Arrivals(np.zeros((0, 2)), np.zeros(0))
+    row, size = int(columns["row"]), columns["traffic_log.size"]
+    path, valid = columns["traffic_log.position"][:, row:], columns["traffic_log.valid"][:, row:]
+    speed = np.hypot(*columns["traffic_log.velocity"][:, row].T)
     step = np.hypot(*np.diff(path, axis=1, prepend=path[:, :1]).transpose(2, 0, 1))
-    room = np.cumsum(step * valid[:, row:], axis=1) - columns["traffic_log.size"][:, :1] / 2
+    room = np.cumsum(step * valid, axis=1) - size[:, :1] / 2
     needed = reaction_s * speed + speed**2 / (2.0 * braking_mps2)
-    return valid[:, row:] & valid[:, row : row + 1] & (speed > 0)[:, None] & (room < needed[:, None])
+    users, steps = np.nonzero(valid & valid[:, :1] & (speed > 0)[:, None] & (room < needed[:, None]))
+    return _Arrivals(path[users, steps], size[users, 1] / 2)
 
 
-def _is_run_into(
-    line: Float[np.ndarray, "N 2"], columns: Mapping[str, np.ndarray], come: Bool[np.ndarray, "K T"], car_size_m: list[float]
-) -> bool:
-    """Whether a road user touches a car at the beginning of a line at a place before which it cannot stop (`come`)."""
+def _is_run_into(line: Float[np.ndarray, "N 2"], come: _Arrivals, car_size_m: list[float]) -> bool:
+    """Whether a road user touches a car at the beginning of a line at a place before which it cannot stop."""
     place, yaw = _point_at(line, 0.0)
-    users, steps = np.nonzero(come)
-    offset = columns["traffic_log.position"][users, int(columns["row"]) + steps] - place
-    along = np.abs(np.cos(yaw) * offset[:, 0] + np.sin(yaw) * offset[:, 1]) - car_size_m[0] / 2
-    across = np.abs(np.cos(yaw) * offset[:, 1] - np.sin(yaw) * offset[:, 0]) - car_size_m[1] / 2
-    return bool((np.hypot(np.maximum(along, 0.0), np.maximum(across, 0.0)) <= columns["traffic_log.size"][users, 1] / 2).any())
+    return bool((_measure_to_box(come.place - place, yaw, np.array(car_size_m)) <= come.half_width).any())
 
 
 def _measure_distances(points: Float[np.ndarray, "N 2"], columns: Mapping[str, np.ndarray], users: np.ndarray) -> Float[np.ndarray, "N K"]:
     """Distances of points from the outlines of road users at the start; 0 inside."""
     row = int(columns["row"])
     offset = points[:, None] - columns["traffic_log.position"][users, row]
-    yaw = columns["traffic_log.yaw"][users, row]
+    return _measure_to_box(offset, columns["traffic_log.yaw"][users, row], columns["traffic_log.size"][users])
+
+
+def _measure_to_box(
+    offset: Float[np.ndarray, "*n 2"], yaw: Float[np.ndarray, "*#n"] | float, size: Float[np.ndarray, "*#n 2"]
+) -> Float[np.ndarray, "*n"]:
+    """Distances of points at offsets from the centres of boxes to their outlines; 0 inside."""
     along = np.cos(yaw) * offset[..., 0] + np.sin(yaw) * offset[..., 1]
     across = -np.sin(yaw) * offset[..., 0] + np.cos(yaw) * offset[..., 1]
-    beyond = np.maximum(np.abs(np.stack([along, across], axis=-1)) - columns["traffic_log.size"][users] / 2, 0.0)
+    beyond = np.maximum(np.abs(np.stack([along, across], axis=-1)) - size / 2, 0.0)
     return np.hypot(beyond[..., 0], beyond[..., 1])
 
 
