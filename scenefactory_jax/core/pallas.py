@@ -24,6 +24,20 @@ def on_gpu(quick: Callable, plain: Callable, *arguments: Any) -> Any:
     return jax.lax.platform_dependent(*arguments, cuda=quick, default=plain)
 
 
+def dispatch(kernel: Callable, plain: Callable, *operands: Any) -> Any:
+    """Calls the kernel on NVIDIA GPUs and plain JAX elsewhere, with the derivative of plain JAX."""
+
+    @jax.custom_jvp
+    def call(*operands: Any) -> Any:
+        return on_gpu(kernel, plain, *operands)
+
+    @call.defjvp
+    def _(primals: tuple, tangents: tuple) -> tuple:
+        return jax.jvp(plain, primals, tangents)
+
+    return call(*operands)
+
+
 def row(operand: Any) -> pl.BlockSpec:
     """Each program's own row of an operand, in a grid of one axis."""
     rest = operand.shape[1:]

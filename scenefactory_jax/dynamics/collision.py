@@ -25,7 +25,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from scenefactory_jax.core import schema
+from scenefactory_jax.core import lanes, schema
 from scenefactory_jax.core.geometry import cross, dot, safe_norm
 from scenefactory_jax.core.pytree import is_finite, replace
 from scenefactory_jax.core.schema import Bounds, ConfigError, NonNegative, Positive
@@ -87,12 +87,13 @@ class ContactLaw:
     max_neighbours: Annotated[int, Bounds(min=0)]  # objects that a car may touch, beside other cars
 
 
-def make_contact(entry: Mapping[str, Any], *, height: float, step_s: float) -> Contact:
+def make_contact(entry: Mapping[str, Any], *, height: float, step_s: float, kernels: bool = False) -> Contact:
     """Makes the contact model of a config's `dynamics.contact`.
 
     Args:
         height: of the boxes, m; two whose elevations differ by more do not touch.
         step_s: time step of the forces, s.
+        kernels: Triton kernels for the pairs, on NVIDIA GPUs.
 
     Raises:
         ConfigError: a number out of range, or a contact too stiff for `step_s`, by name.
@@ -105,7 +106,7 @@ def make_contact(entry: Mapping[str, Any], *, height: float, step_s: float) -> C
             f"4, got {load:.2f} at a time step of {step_s:.5f} s"
         )
     neighbours = functools.partial(find_neighbours, max_neighbours=law.max_neighbours)
-    return Contact(init, neighbours, functools.partial(compute_forces, law=law, height=height, step_s=step_s))
+    return Contact(init, neighbours, functools.partial(compute_forces, law=law, height=height, step_s=step_s, kernels=kernels))
 
 
 def init(cars: int, objects: int) -> ContactState:
@@ -153,7 +154,7 @@ def report_forces(contact: Contact, cars: Boxes, traffic: Boxes, seconds: float)
 
 
 def compute_forces(
-    state: ContactState, cars: Boxes, neighbours: Neighbours, *, law: ContactLaw, height: float, step_s: float
+    state: ContactState, cars: Boxes, neighbours: Neighbours, *, law: ContactLaw, height: float, step_s: float, kernels: bool = False
 ) -> tuple[ContactState, Float[Array, "A 2"], Float[Array, " A"], Float[Array, " A"]]:
     """Computes the horizontal force and yaw torque on each car's box centre, and the largest force of a single pair, N and N m.
 
@@ -166,24 +167,27 @@ def compute_forces(
             more than `height` do not touch.
         neighbours: they follow their path and feel no force. If their mass is finite, the force is limited to what gives them the car's
             speed within `momentum_transfer_s`, and ends after that time.
+        kernels: as of `make_contact`.
     """
     count, beside = neighbours.rows.shape
-    shared: dict[str, Any] = {"law": law, "height": height, "step_s": step_s}
+    compute = functools.partial(compute_pair_force, law=law, height=height, step_s=step_s)
+    compute_all = functools.partial(lanes.map_cases, enable=kernels)
     cars = _sanitize(cars, law.mass)
     total, torque, largest, contacts = jnp.zeros((count, 2)), jnp.zeros(count), jnp.zeros(count), jnp.zeros(count)
     if beside:
         first = jax.tree.map(lambda leaf: jnp.repeat(leaf, beside, axis=0), cars)
         second = _sanitize(jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), neighbours.boxes), law.mass)
         places = jnp.arange(count)[:, None], neighbours.rows
-        axis, pair_force, pair_torque, _ = _compute_pair_forces(state.traffic[places].ravel(), first, second, limited=True, **shared)
+        pairs = state.traffic[places].ravel(), first, second
+        axis, pair_force, pair_torque, _ = compute_all(functools.partial(compute, limited=True), *pairs, name="touch_traffic")
         state = state._replace(traffic=jnp.full_like(state.traffic, NO_AXIS).at[places].set(axis.reshape(count, beside)))
         pair_force, pair_torque = pair_force.reshape(count, beside, 2), pair_torque.reshape(count, beside)
         contacts = (safe_norm(pair_force) > 0.0).sum(1, dtype=jnp.float32)
     if count > 1:
         rows_first, rows_second = np.triu_indices(count, 1)
         first, second = jax.tree.map(lambda leaf: leaf[rows_first], cars), jax.tree.map(lambda leaf: leaf[rows_second], cars)
-        previous = state.cars[rows_first, rows_second]
-        axis, force, torque_first, torque_second = _compute_pair_forces(previous, first, second, limited=False, **shared)
+        pairs = state.cars[rows_first, rows_second], first, second
+        axis, force, torque_first, torque_second = compute_all(functools.partial(compute, limited=False), *pairs, name="touch_cars")
         state = state._replace(cars=state.cars.at[rows_first, rows_second].set(axis))
         rows = _find_pairs(count)
         contacts = contacts + jnp.tile(safe_norm(force) > 0.0, 2)[rows].sum(1, dtype=jnp.float32)
@@ -209,42 +213,42 @@ def _scale_of_many(contacts: Float[Array, "*n"]) -> Float[Array, "*n"]:
     return jnp.minimum(1.0, 2.0 / jnp.maximum(contacts, 1.0))
 
 
-def _compute_pair_forces(
-    axis: Int[Array, " N"], first: Boxes, second: Boxes, *, limited: bool, law: ContactLaw, height: float, step_s: float
-) -> tuple[Int[Array, " N"], Float[Array, "N 2"], Float[Array, " N"], Float[Array, " N"]]:
-    """Computes the axis of each pair, the force on its second box (the first has the opposite), and the torques on both."""
-    separation = jax.vmap(compute_separation)(first, second)
-    axis = jax.vmap(select_axis)(separation, axis)
-    begin, touches = jax.vmap(functools.partial(find_begin, step_s=step_s))(separation, axis)
-    first, second = (replace(box, position=box.position + begin[:, None] * box.velocity) for box in (first, second))
-    normal, points, depths = jax.vmap(find_contact_points)(axis, first, second)
+def compute_pair_force(
+    axis: Int[Array, ""], first: Boxes, second: Boxes, *, limited: bool, law: ContactLaw, height: float, step_s: float
+) -> tuple[Int[Array, ""], Float[Array, "2"], Float[Array, ""], Float[Array, ""]]:
+    """Computes the axis of a pair, the force on its second box (the first has the opposite), and the torques on both."""
+    separation = compute_separation(first, second)
+    axis = select_axis(separation, axis)
+    begin, touches = find_begin(separation, axis, step_s=step_s)
+    first, second = (replace(box, position=box.position + begin * box.velocity) for box in (first, second))
+    normal, points, depths = find_contact_points(axis, first, second)
     near = touches & first.present & second.present & (jnp.abs(first.elevation - second.elevation) < height)
 
-    arm_first, arm_second = points - first.position[:, None], points - second.position[:, None]
+    arm_first, arm_second = points - first.position, points - second.position
     speed = _velocity_at(arm_second, second.velocity, second.yaw_rate) - _velocity_at(arm_first, first.velocity, first.yaw_rate)
     tangent = _rotate_90(normal)
-    closing = -dot(speed, normal[:, None])
-    sliding = dot(speed, tangent[:, None])
-    left = step_s - begin[:, None]  # of the step
-    depth = _average_depth(depths, closing, left) * jnp.where(near[:, None], left / step_s, 0.0)
-    scale = (2.0 / (law.mass / first.mass + law.mass / second.mass))[:, None]
+    closing = -dot(speed, normal)
+    sliding = dot(speed, tangent)
+    left = step_s - begin  # of the step
+    depth = _average_depth(depths, closing, left) * jnp.where(near, left / step_s, 0.0)
+    scale = 2.0 / (law.mass / first.mass + law.mass / second.mass)
     spring = 0.5 * law.stiffness * scale * depth
-    levers = 1.0 / first.mass[:, None] + 1.0 / second.mass[:, None]
+    levers = 1.0 / first.mass + 1.0 / second.mass
     levers = levers + _lever(arm_first, normal, first) + _lever(arm_second, normal, second)
-    implicit = 1.0 + step_s * law.dissipation * spring.sum(1, keepdims=True) * levers
+    implicit = 1.0 + step_s * law.dissipation * spring.sum() * levers
     push = spring * jnp.maximum(1.0 + law.dissipation * closing, 0.0) / implicit
     reduced = 0.5 * law.mass * scale
     if limited:
         # per contact point; at a constant closing speed, the depth that it reaches in that time says when it is over
         approach = jnp.maximum(closing, 0.0)
         limit = jnp.where(depths < approach * law.momentum_transfer_s, 0.5 * reduced * approach / law.momentum_transfer_s, 0.0)
-        push = jnp.where(jnp.isfinite(second.mass)[:, None], jnp.minimum(push, limit), push)
+        push = jnp.where(jnp.isfinite(second.mass), jnp.minimum(push, limit), push)
     drag = jnp.clip(0.125 * reduced / step_s * sliding, -law.friction * push, law.friction * push)
-    force = push[..., None] * normal[:, None] - drag[..., None] * tangent[:, None]
-    return axis, force.sum(1), -cross(arm_first, force).sum(1), cross(arm_second, force).sum(1)
+    force = push[:, None] * normal - drag[:, None] * tangent
+    return axis, force.sum(0), -cross(arm_first, force).sum(), cross(arm_second, force).sum()
 
 
-def _average_depth(depth: Float[Array, "N 2"], closing: Float[Array, "N 2"], seconds: Float[Array, "N 1"]) -> Float[Array, "N 2"]:
+def _average_depth(depth: Float[Array, "2"], closing: Float[Array, "2"], seconds: Float[Array, ""]) -> Float[Array, "2"]:
     """Computes the mean of max(0, depth) over a time with a constant closing speed, m."""
     after = depth + closing * seconds
     low, high = jnp.minimum(depth, after), jnp.maximum(depth, after)
@@ -252,10 +256,10 @@ def _average_depth(depth: Float[Array, "N 2"], closing: Float[Array, "N 2"], sec
     return jnp.where(low >= 0.0, 0.5 * (low + high), partly)
 
 
-def _lever(arm: Float[Array, "N 2 2"], normal: Float[Array, "N 2"], box: Boxes) -> Float[Array, "N 2"]:
+def _lever(arm: Float[Array, "2 2"], normal: Float[Array, "2"], box: Boxes) -> Float[Array, "2"]:
     """Computes what rotation adds to the inverse mass of a contact point, 1/kg; a box has the inertia of a homogeneous one."""
-    inertia = box.mass * (box.size**2).sum(-1) / 12.0
-    return cross(arm, normal[:, None]) ** 2 / inertia[:, None]
+    inertia = box.mass * (box.size**2).sum() / 12.0
+    return cross(arm, normal) ** 2 / inertia
 
 
 def _is_valid(boxes: Boxes) -> Bool[Array, "*n"]:
@@ -358,6 +362,6 @@ def _rotate_90(v: Float[Array, "*shape 2"]) -> Float[Array, "*shape 2"]:
     return jnp.stack([-v[..., 1], v[..., 0]], axis=-1)
 
 
-def _velocity_at(arm: Float[Array, "N 2 2"], velocity: Float[Array, "N 2"], yaw_rate: Float[Array, " N"]) -> Float[Array, "N 2 2"]:
+def _velocity_at(arm: Float[Array, "2 2"], velocity: Float[Array, "2"], yaw_rate: Float[Array, ""]) -> Float[Array, "2 2"]:
     """Computes the velocity of points at `arm` from a centre that moves and rotates."""
-    return velocity[:, None] + yaw_rate[:, None, None] * _rotate_90(arm)
+    return velocity + yaw_rate * _rotate_90(arm)

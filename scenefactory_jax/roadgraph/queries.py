@@ -4,8 +4,7 @@ Plain JAX. On NVIDIA GPUs the kernels of `road_kernels` compute the same; deriva
 """
 
 import functools
-from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -23,7 +22,7 @@ from scenefactory_jax.core.geometry import (
     take_smallest,
     to_frame,
 )
-from scenefactory_jax.core.pallas import on_gpu
+from scenefactory_jax.core.pallas import dispatch
 from scenefactory_jax.core.types import Road, Scene, SetObservation, SpatialGrid
 from scenefactory_jax.roadgraph import road_kernels, spatial_grid
 
@@ -57,7 +56,7 @@ def query_road(
 
     kernel = functools.partial(road_kernels.query_road_blocks, half_width_m=half_width_m, range_m=range_m)
     operands = (scene.lanes, scene.edges, circles, radius, velocity, heading_vector(yaw), position, active)
-    lane, squared, rate = _dispatch(kernel, plain, *operands) if kernels else plain(*operands)
+    lane, squared, rate = dispatch(kernel, plain, *operands) if kernels else plain(*operands)
     approaches = rate > 0
     return RoadQuery(lane, safe_sqrt(squared), jnp.where(approaches, 1.0 / jnp.where(approaches, rate, 1.0), jnp.inf))
 
@@ -145,7 +144,7 @@ def gather_segments(
 
     first, last = spatial_grid.find_cell_bounds(scene.road_grid, position)
     operands = (scene.road, scene.road_grid, first, jnp.where(active, last, first), position, yaw)
-    return SetObservation(*(_dispatch(kernel, plain, *operands) if kernels else plain(*operands)))
+    return SetObservation(*(dispatch(kernel, plain, *operands) if kernels else plain(*operands)))
 
 
 def _segment_features(
@@ -169,17 +168,3 @@ def find_first_true(flags: Bool[Array, "A P"], *, count: int) -> tuple[Int[Array
     index = jax.vmap(lambda row: jnp.searchsorted(row, ranks, method="scan_unrolled"))(running)
     mask = ranks <= running[:, -1:]
     return jnp.where(mask, index, 0), mask
-
-
-def _dispatch(kernel: Callable, plain: Callable, *operands: Any) -> Any:
-    """Calls the kernel on NVIDIA GPUs and plain JAX elsewhere, with the derivative of plain JAX."""
-
-    @jax.custom_jvp
-    def call(*operands: Any) -> Any:
-        return on_gpu(kernel, plain, *operands)
-
-    @call.defjvp
-    def _(primals: tuple, tangents: tuple) -> tuple:
-        return jax.jvp(plain, primals, tangents)
-
-    return call(*operands)

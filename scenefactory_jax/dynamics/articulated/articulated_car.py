@@ -13,6 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
+from scenefactory_jax.core import lanes
 from scenefactory_jax.core.geometry import heading_vector, safe_norm
 from scenefactory_jax.core.instantiate import ConfigError, instantiate
 from scenefactory_jax.core.pytree import pytree_dataclass, replace, tree_where
@@ -71,6 +72,7 @@ class CompiledCar(NamedTuple):
     rest_pose: np.ndarray  # qpos
     physics_dt: float
     substeps: int
+    kernels: bool
 
 
 def make(
@@ -83,6 +85,7 @@ def make(
     friction: Callable[..., Any],
     physics_dt: float,
     control_dt: float,
+    kernels: bool = False,
 ) -> Dynamics:
     """Makes the backend: cars with 10 joints each.
 
@@ -96,13 +99,14 @@ def make(
             `physics_dt`.
         friction: (weather, position, speed) -> positive friction coefficient, evaluated for every wheel at the start of every control step.
         physics_dt: s; `control_dt` must be a multiple of it.
+        kernels: Triton kernels for the closed-form step (on flat roads) and for contacts, on NVIDIA GPUs.
 
     Raises:
         ConfigError: an unknown or missing number by name, a spring too stiff for the time step, or time steps that do not fit.
     """
     parameters, settings = read_parameters({"car": car, "solver": solver})
-    compiled = compile_car(parameters, settings, abs_enabled=abs, physics_dt=physics_dt, control_dt=control_dt)
-    forces = collision.make_contact(contact, height=parameters.height, step_s=physics_dt)
+    compiled = compile_car(parameters, settings, abs_enabled=abs, physics_dt=physics_dt, control_dt=control_dt)._replace(kernels=kernels)
+    forces = collision.make_contact(contact, height=parameters.height, step_s=physics_dt, kernels=kernels)
     if randomization is not None:
         module = "scenefactory_jax.dynamics.articulated.randomization"
         entry = instantiate(randomization, builtins=module, where="dynamics.randomization", car=parameters, physics_dt=physics_dt)
@@ -136,6 +140,7 @@ def compile_car(
         rest_pose=models.find_rest_pose(model, car),
         physics_dt=physics_dt,
         substeps=substeps,
+        kernels=False,
     )
 
 
@@ -206,8 +211,7 @@ def control_step(
     if mu.shape != wheels.shape[:-1] or not jnp.issubdtype(mu.dtype, jnp.floating):
         raise ConfigError(f"weather.friction: expected floating-point numbers {list(wheels.shape[:-1])}, got {mu.dtype} {list(mu.shape)}")
     command = actuators.compute_command(car, action)
-    each = None if body.constants is None else 0
-    step = jax.vmap(functools.partial(physics_step, compiled), in_axes=(each, 0, 0, 0, 0, 0, None))
+    step = make_step(compiled, body.constants, fields, scene.elevation)
     mass = equations_of_motion.total_mass(car)
     neighbours = contact.neighbours(collect_boxes(motion, scene.agents.size, active, mass), scene.traffic)
 
@@ -216,7 +220,7 @@ def control_step(
         beside = neighbours._replace(boxes=advance_boxes(neighbours.boxes, time))
         state, force, torque, strength = contact.forces(body.contact, boxes, beside)
         carry = CarCarry(body.qpos, body.qvel, body.qacc_warmstart, body.tyres)
-        carry = step(constants, fields, carry, command, PlanarForce(force, torque), mu, scene.elevation)
+        carry = step(carry, command, PlanarForce(force, torque), mu)
         return replace(body, **carry._asdict(), contact=state, contact_force=jnp.maximum(body.contact_force, strength)), None
 
     zero = jnp.zeros_like(body.contact_force)
@@ -224,6 +228,25 @@ def control_step(
     after, _ = jax.lax.scan(substep, replace(body, contact_force=zero), times)
     still = replace(body.tyres, tangent=jnp.zeros_like(body.tyres.tangent), slip=jnp.zeros_like(body.tyres.slip))
     return tree_where(active, after, replace(body, contact_force=zero, tyres=still))
+
+
+def make_step(
+    compiled: CompiledCar, constants: CarConstants | None, fields: dict[str, Array], elevation: Elevation | None
+) -> Callable[[CarCarry, Command, PlanarForce, Float[Array, "A 4"]], CarCarry]:
+    """Makes the physics step of all cars. On flat roads the closed form may be a kernel.
+
+    Args:
+        constants: of cars that differ.
+        fields: of MJX's model, with a car axis, where cars differ.
+    """
+    if compiled.mjx_car is None and elevation is None:
+        map_cars = functools.partial(lanes.map_cases, name="step_car", enable=compiled.kernels)
+        if constants is None:
+            return functools.partial(map_cars, functools.partial(physics_step, compiled, compiled.constants, {}))
+        return functools.partial(map_cars, lambda own, *inputs: physics_step(compiled, own, {}, *inputs), constants)
+    axes = (None if constants is None else 0, 0, 0, 0, 0, 0, None)
+    map_cars = jax.vmap(functools.partial(physics_step, compiled), in_axes=axes)
+    return lambda *inputs: map_cars(constants or compiled.constants, fields, *inputs, elevation)  # pyright: ignore[reportCallIssue]
 
 
 def physics_step(
