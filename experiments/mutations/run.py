@@ -89,7 +89,7 @@ MUTATIONS = (
              "(agents.speed / radius)", "(0.0 * agents.speed / radius)",
              "dynamics/test_dynamics.py::test_cars_start_at_rest_height_with_turning_wheels"),
     Mutation("physics", "tyres bounce: no damping along the road's normal", "dynamics/articulated/tyres.py",
-             "2.0 / (impedance * constant) * dot(state.up, patch.velocity)", "0.0 * dot(state.up, patch.velocity)",
+             "2.0 / (impedance * constant) * dot(up, patch.velocity)", "0.0 * dot(up, patch.velocity)",
              "dynamics/test_equations_of_motion.py::test_the_problem_is_that_of_mjx_for_cars_that_differ"),
     Mutation("physics", "sliding friction does not fall", "dynamics/articulated/tyres.py",
              "(1.0 - car.tyre_sliding_fraction) * jnp.exp(", "(1.0 - car.tyre_sliding_fraction) + 0.0 * jnp.exp(",

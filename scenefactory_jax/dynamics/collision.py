@@ -67,12 +67,19 @@ class Neighbours(NamedTuple):
     rows: Int[Array, "A K"]  # of the traffic
 
 
+class Axes(NamedTuple):
+    """What `ContactState` has, of the pairs that can touch in a control step."""
+
+    cars: Int[Array, "A A"]
+    beside: Int[Array, "A K"]
+
+
 class Contact(NamedTuple):
     """The contact model. Neighbours are selected once per control step, forces computed once per physics step."""
 
     init: Callable[[int, int], ContactState]  # (cars, objects of traffic)
     neighbours: Callable[[Boxes, Boxes], Neighbours]  # (cars, traffic)
-    forces: Callable[[ContactState, Boxes, Neighbours], tuple[ContactState, Array, Array, Array]]  # see `compute_forces`
+    forces: Callable[[Axes, Boxes, Neighbours], tuple[Axes, Array, Array, Array]]  # see `compute_forces`
 
 
 @dataclasses.dataclass(frozen=True)
@@ -114,6 +121,17 @@ def init(cars: int, objects: int) -> ContactState:
     return ContactState(jnp.full((cars, cars), NO_AXIS, jnp.int32), jnp.full((cars, objects), NO_AXIS, jnp.int32))
 
 
+def read_axes(state: ContactState, neighbours: Neighbours) -> Axes:
+    """Reads the axes of the pairs that can touch in a control step."""
+    return Axes(state.cars, state.traffic[jnp.arange(len(neighbours.rows))[:, None], neighbours.rows])
+
+
+def keep_axes(axes: Axes, neighbours: Neighbours, state: ContactState) -> ContactState:
+    """Keeps the axes after a control step; objects that were not among the neighbours are new when they are again."""
+    places = jnp.arange(len(neighbours.rows))[:, None], neighbours.rows
+    return ContactState(axes.cars, jnp.full_like(state.traffic, NO_AXIS).at[places].set(axes.beside))
+
+
 def collect_boxes(motion: Motion, size: Float[Array, "A 2"], active: Bool[Array, " A"], mass: float | Float[Array, "*A"]) -> Boxes:
     """Collects cars as boxes; `mass` per car, or one for all."""
     return Boxes(
@@ -150,12 +168,12 @@ def report_forces(contact: Contact, cars: Boxes, traffic: Boxes, seconds: float)
     """Computes the largest contact force of each car now, N, for cars that contacts do not move; `traffic` is as it was `seconds` ago."""
     beside = contact.neighbours(cars, traffic)
     beside = beside._replace(boxes=advance_boxes(beside.boxes, seconds))
-    return contact.forces(contact.init(cars.mass.shape[0], traffic.mass.shape[0]), cars, beside)[3]
+    return contact.forces(read_axes(contact.init(cars.mass.shape[0], traffic.mass.shape[0]), beside), cars, beside)[3]
 
 
 def compute_forces(
-    state: ContactState, cars: Boxes, neighbours: Neighbours, *, law: ContactLaw, height: float, step_s: float, kernels: bool = False
-) -> tuple[ContactState, Float[Array, "A 2"], Float[Array, " A"], Float[Array, " A"]]:
+    axes: Axes, cars: Boxes, neighbours: Neighbours, *, law: ContactLaw, height: float, step_s: float, kernels: bool = False
+) -> tuple[Axes, Float[Array, "A 2"], Float[Array, " A"], Float[Array, " A"]]:
     """Computes the horizontal force and yaw torque on each car's box centre, and the largest force of a single pair, N and N m.
 
     The stiffness of a pair scales with its reduced mass over that of two cars: 1 between cars, 2 against a wall, little against a
@@ -177,18 +195,17 @@ def compute_forces(
     if beside:
         first = jax.tree.map(lambda leaf: jnp.repeat(leaf, beside, axis=0), cars)
         second = _sanitize(jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), neighbours.boxes), law.mass)
-        places = jnp.arange(count)[:, None], neighbours.rows
-        pairs = state.traffic[places].ravel(), first, second
+        pairs = axes.beside.ravel(), first, second
         axis, pair_force, pair_torque, _ = compute_all(functools.partial(compute, limited=True), *pairs, name="touch_traffic")
-        state = state._replace(traffic=jnp.full_like(state.traffic, NO_AXIS).at[places].set(axis.reshape(count, beside)))
+        axes = axes._replace(beside=axis.reshape(count, beside))
         pair_force, pair_torque = pair_force.reshape(count, beside, 2), pair_torque.reshape(count, beside)
         contacts = (safe_norm(pair_force) > 0.0).sum(1, dtype=jnp.float32)
     if count > 1:
         rows_first, rows_second = np.triu_indices(count, 1)
         first, second = jax.tree.map(lambda leaf: leaf[rows_first], cars), jax.tree.map(lambda leaf: leaf[rows_second], cars)
-        pairs = state.cars[rows_first, rows_second], first, second
+        pairs = axes.cars[rows_first, rows_second], first, second
         axis, force, torque_first, torque_second = compute_all(functools.partial(compute, limited=False), *pairs, name="touch_cars")
-        state = state._replace(cars=state.cars.at[rows_first, rows_second].set(axis))
+        axes = axes._replace(cars=axes.cars.at[rows_first, rows_second].set(axis))
         rows = _find_pairs(count)
         contacts = contacts + jnp.tile(safe_norm(force) > 0.0, 2)[rows].sum(1, dtype=jnp.float32)
         scale = _scale_of_many(jnp.maximum(contacts[rows_first], contacts[rows_second]))
@@ -201,7 +218,7 @@ def compute_forces(
         force = scale[..., None] * pair_force
         total, torque = total - force.sum(1), torque + (scale * pair_torque).sum(1)
         largest = jnp.maximum(largest, safe_norm(force).max(1))
-    return state, total, torque, largest
+    return axes, total, torque, largest
 
 
 def _scale_of_many(contacts: Float[Array, "*n"]) -> Float[Array, "*n"]:

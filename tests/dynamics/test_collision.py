@@ -29,8 +29,8 @@ def with_numbers(**changes):
     model = collision.make_contact(NUMBERS | changes, height=1.0, step_s=DT)
 
     def forces(cars, others):
-        state = model.init(cars.mass.shape[0], others.mass.shape[0])
-        return model.forces(state, cars, model.neighbours(cars, others))[1:]
+        state, beside = model.init(cars.mass.shape[0], others.mass.shape[0]), model.neighbours(cars, others)
+        return model.forces(collision.read_axes(state, beside), cars, beside)[1:]
 
     return forces
 
@@ -287,7 +287,9 @@ def advancing(steps, driven, changes):
 
     def step(now, _):
         cars, others, state = now
-        state, force, torque, largest = model.forces(state, cars, model.neighbours(cars, others))
+        beside = model.neighbours(cars, others)
+        axes, force, torque, largest = model.forces(collision.read_axes(state, beside), cars, beside)
+        state = collision.keep_axes(axes, beside, state)
         velocity = cars.velocity + DT * force / cars.mass[:, None]
         inertia = cars.mass * (cars.size**2).sum(-1) / 12
         rate = cars.yaw_rate + DT * torque / inertia

@@ -34,7 +34,7 @@ from scenefactory_jax.dynamics.articulated.tyres import (
     find_contact_patches,
 )
 from scenefactory_jax.dynamics.articulated.vector import Vector, dot
-from scenefactory_jax.dynamics.collision import Contact, ContactState, advance_boxes, collect_boxes
+from scenefactory_jax.dynamics.collision import Axes, Contact, ContactState, advance_boxes, collect_boxes, keep_axes, read_axes
 from scenefactory_jax.roadgraph.elevation import find_start_ground
 
 
@@ -215,17 +215,20 @@ def control_step(
     mass = equations_of_motion.total_mass(car)
     neighbours = contact.neighbours(collect_boxes(motion, scene.agents.size, active, mass), scene.traffic)
 
-    def substep(body: Body, time: Float[Array, ""]) -> tuple[Body, None]:
+    def substep(before: tuple[Body, Axes], time: Float[Array, ""]) -> tuple[tuple[Body, Axes], None]:
+        body, axes = before
         boxes = collect_boxes(read(compiled, body), scene.agents.size, active, mass)
         beside = neighbours._replace(boxes=advance_boxes(neighbours.boxes, time))
-        state, force, torque, strength = contact.forces(body.contact, boxes, beside)
+        axes, force, torque, strength = contact.forces(axes, boxes, beside)
         carry = CarCarry(body.qpos, body.qvel, body.qacc_warmstart, body.tyres)
         carry = step(carry, command, PlanarForce(force, torque), mu)
-        return replace(body, **carry._asdict(), contact=state, contact_force=jnp.maximum(body.contact_force, strength)), None
+        return (replace(body, **carry._asdict(), contact_force=jnp.maximum(body.contact_force, strength)), axes), None
 
     zero = jnp.zeros_like(body.contact_force)
     times = compiled.physics_dt * jnp.arange(compiled.substeps)
-    after, _ = jax.lax.scan(substep, replace(body, contact_force=zero), times)
+    begun = replace(body, contact_force=zero), read_axes(body.contact, neighbours)
+    (after, axes), _ = jax.lax.scan(substep, begun, times)
+    after = replace(after, contact=keep_axes(axes, neighbours, body.contact))
     still = replace(body.tyres, tangent=jnp.zeros_like(body.tyres.tangent), slip=jnp.zeros_like(body.tyres.slip))
     return tree_where(active, after, replace(body, contact_force=zero, tyres=still))
 
