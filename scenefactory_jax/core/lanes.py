@@ -65,19 +65,19 @@ def _call(function: Callable[..., Any], *leaves: Array, name: str, interpret: bo
     examples, count = [*map(_drop_cases, leaves)], len(leaves[0])
     results, run = jax.tree.leaves(jax.eval_shape(function, *examples)), scalars.unroll(function, *examples)
     used = scalars.find_used(function, *examples)
-    read = [leaf.reshape(count, -1).astype(_stored(leaf.dtype)) for leaf, needed in zip(leaves, used, strict=True) if needed]
-    written = [jax.ShapeDtypeStruct((count, part.size), _stored(part.dtype)) for part in results]
+    read = [leaf.astype(stored(leaf.dtype)) for leaf, needed in zip(leaves, used, strict=True) if needed]
+    written = [jax.ShapeDtypeStruct((count, *part.shape), stored(part.dtype)) for part in results]
 
     def kernel(*references: Any) -> None:
         rows = pl.program_id(0) * LANES + jnp.arange(LANES, dtype=jnp.int32)
         inside, inputs = rows < count, iter(references)
         elements = [
-            _load(next(inputs), rows, inside, case) if needed else np.empty(case.shape, object)
+            load(next(inputs), (rows,), inside, case) if needed else np.empty(case.shape, object)
             for case, needed in zip(examples, used, strict=True)
         ]
         for reference, part in zip(inputs, run(*elements), strict=True):
-            for column, element in enumerate(part.ravel()):
-                plgpu.store(reference.at[rows, column], jnp.broadcast_to(element, LANES).astype(reference.dtype), mask=inside)
+            for place, element in np.ndenumerate(part):
+                plgpu.store(reference.at[(rows, *place)], jnp.broadcast_to(element, LANES).astype(reference.dtype), mask=inside)
 
     found = pl.pallas_call(
         kernel,
@@ -89,18 +89,25 @@ def _call(function: Callable[..., Any], *leaves: Array, name: str, interpret: bo
         interpret=interpret,
         name=name,
     )(*read)
-    return tuple(part.reshape(count, *like.shape).astype(like.dtype) for part, like in zip(found, results, strict=True))
+    return tuple(part.astype(like.dtype) for part, like in zip(found, results, strict=True))
 
 
-def _stored(dtype: Any) -> Any:
+def stored(dtype: Any) -> Any:
     """The type of numbers in memory: Triton loads no truth values."""
     return jnp.int8 if dtype == jnp.bool_ else dtype
 
 
-def _load(reference: Any, rows: Array, inside: Array, case: jax.ShapeDtypeStruct) -> scalars.Elements:
-    """Reads the elements of an array of all lanes."""
+def load(reference: Any, at: tuple[Array, ...], mask: Array, case: jax.ShapeDtypeStruct) -> scalars.Elements:
+    """Reads the elements of the arrays of all lanes.
+
+    Args:
+        reference: to a table of such arrays, in the type of `stored`.
+        at: indices of each lane's array.
+        mask: of the lanes that have one.
+        case: shape and type of one.
+    """
     elements = np.empty(case.shape, object)
-    for column, place in enumerate(np.ndindex(case.shape)):
-        value = plgpu.load(reference.at[rows, column], mask=inside, other=0)
+    for place in np.ndindex(case.shape):
+        value = plgpu.load(reference.at[(*at, *place)], mask=mask, other=0)
         elements[place] = value != 0 if case.dtype == jnp.bool_ else value
     return elements

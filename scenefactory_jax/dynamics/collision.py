@@ -25,11 +25,13 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from scenefactory_jax.core import lanes, schema
+from scenefactory_jax.core import schema
 from scenefactory_jax.core.geometry import cross, dot, safe_norm
+from scenefactory_jax.core.pallas import dispatch
 from scenefactory_jax.core.pytree import is_finite, replace
 from scenefactory_jax.core.schema import Bounds, ConfigError, NonNegative, Positive
 from scenefactory_jax.core.types import Boxes, Motion
+from scenefactory_jax.dynamics import contact_kernel
 
 OFF_CENTRE = 3.7  # effective mass of a contact at the middle of two cars' faces over that at their corners
 REPORT_S = 1e-3  # time step of forces that are reported and do not move cars
@@ -148,8 +150,7 @@ def collect_boxes(motion: Motion, size: Float[Array, "A 2"], active: Bool[Array,
 
 def find_neighbours(cars: Boxes, traffic: Boxes, *, max_neighbours: int) -> Neighbours:
     """Finds the boxes of `traffic` nearest to each car, by the distance to their bounding circles."""
-    reach = 0.5 * safe_norm(traffic.size)
-    gap = safe_norm(traffic.position[None] - cars.position[:, None]) - reach
+    gap = safe_norm(traffic.position[None] - cars.position[:, None]) - 0.5 * safe_norm(traffic.size)
     gap = jnp.where(_is_valid(traffic) & jnp.isfinite(gap), gap, jnp.inf)
     _, rows = jax.lax.top_k(-gap, min(max_neighbours, gap.shape[1]))
     return Neighbours(jax.tree.map(lambda leaf: leaf[rows], traffic), rows)
@@ -181,47 +182,62 @@ def compute_forces(
     (`OFF_CENTRE`). Semi-implicit Euler is stable while that is below 4.
 
     Args:
-        cars: boxes that are not present, have no size, or have a state that is not finite take no part. Two whose elevations differ by
-            more than `height` do not touch.
+        cars: boxes that are not present, have no size or no finite state take no part. Two whose elevations differ by more than `height` do
+            not touch.
         neighbours: they follow their path and feel no force. If their mass is finite, the force is limited to what gives them the car's
             speed within `momentum_transfer_s`, and ends after that time.
         kernels: as of `make_contact`.
     """
-    count, beside = neighbours.rows.shape
-    compute = functools.partial(compute_pair_force, law=law, height=height, step_s=step_s)
-    compute_all = functools.partial(lanes.map_cases, enable=kernels)
-    cars = _sanitize(cars, law.mass)
+    touch = functools.partial(compute_pair_force, law=law, height=height, step_s=step_s)
+    both = {"touch_car": functools.partial(touch, limited=False), "touch_object": functools.partial(touch, limited=True)}
+    operands = *axes, _sanitize(cars, law.mass), jax.vmap(functools.partial(_sanitize, mass=law.mass))(neighbours.boxes)
+    plain = functools.partial(add_pairs, **both)
+    quick = functools.partial(contact_kernel.compute_forces, scale_of_many=scale_of_many, **both)
+    fits = kernels and neighbours.rows.shape[1] and jax.default_backend() == "gpu"
+    cars_axis, beside_axis, force, torque, largest = dispatch(quick, plain, *operands) if fits else plain(*operands)
+    return Axes(cars_axis, beside_axis), force, torque, largest
+
+
+def add_pairs(
+    cars_axis: Int[Array, "A A"],
+    beside_axis: Int[Array, "A K"],
+    cars: Boxes,
+    beside: Boxes,
+    *,
+    touch_car: contact_kernel.PairForce,
+    touch_object: contact_kernel.PairForce,
+) -> tuple[Int[Array, "A A"], Int[Array, "A K"], Float[Array, "A 2"], Float[Array, " A"], Float[Array, " A"]]:
+    """Adds up the forces of all pairs: `contact_kernel.compute_forces` in plain JAX."""
+    count, objects = beside_axis.shape
     total, torque, largest, contacts = jnp.zeros((count, 2)), jnp.zeros(count), jnp.zeros(count), jnp.zeros(count)
-    if beside:
-        first = jax.tree.map(lambda leaf: jnp.repeat(leaf, beside, axis=0), cars)
-        second = _sanitize(jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), neighbours.boxes), law.mass)
-        pairs = axes.beside.ravel(), first, second
-        axis, pair_force, pair_torque, _ = compute_all(functools.partial(compute, limited=True), *pairs, name="touch_traffic")
-        axes = axes._replace(beside=axis.reshape(count, beside))
-        pair_force, pair_torque = pair_force.reshape(count, beside, 2), pair_torque.reshape(count, beside)
+    if objects:
+        first = jax.tree.map(lambda leaf: jnp.repeat(leaf, objects, axis=0), cars)
+        second = jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), beside)
+        axis, pair_force, pair_torque, _ = jax.vmap(touch_object)(beside_axis.ravel(), first, second)
+        beside_axis = axis.reshape(count, objects)
+        pair_force, pair_torque = pair_force.reshape(count, objects, 2), pair_torque.reshape(count, objects)
         contacts = (safe_norm(pair_force) > 0.0).sum(1, dtype=jnp.float32)
     if count > 1:
         rows_first, rows_second = np.triu_indices(count, 1)
         first, second = jax.tree.map(lambda leaf: leaf[rows_first], cars), jax.tree.map(lambda leaf: leaf[rows_second], cars)
-        pairs = axes.cars[rows_first, rows_second], first, second
-        axis, force, torque_first, torque_second = compute_all(functools.partial(compute, limited=False), *pairs, name="touch_cars")
-        axes = axes._replace(cars=axes.cars.at[rows_first, rows_second].set(axis))
+        axis, force, torque_first, torque_second = jax.vmap(touch_car)(cars_axis[rows_first, rows_second], first, second)
+        cars_axis = cars_axis.at[rows_first, rows_second].set(axis)
         rows = _find_pairs(count)
         contacts = contacts + jnp.tile(safe_norm(force) > 0.0, 2)[rows].sum(1, dtype=jnp.float32)
-        scale = _scale_of_many(jnp.maximum(contacts[rows_first], contacts[rows_second]))
+        scale = scale_of_many(jnp.maximum(contacts[rows_first], contacts[rows_second]))
         force = scale[:, None] * force
         total = jnp.concatenate([-force, force])[rows].sum(1)
         torque = jnp.concatenate([scale * torque_first, scale * torque_second])[rows].sum(1)
         largest = jnp.tile(safe_norm(force), 2)[rows].max(1)
-    if beside:
-        scale = _scale_of_many(contacts)[:, None]
+    if objects:
+        scale = scale_of_many(contacts)[:, None]
         force = scale[..., None] * pair_force
         total, torque = total - force.sum(1), torque + (scale * pair_torque).sum(1)
         largest = jnp.maximum(largest, safe_norm(force).max(1))
-    return axes, total, torque, largest
+    return cars_axis, beside_axis, total, torque, largest
 
 
-def _scale_of_many(contacts: Float[Array, "*n"]) -> Float[Array, "*n"]:
+def scale_of_many(contacts: Float[Array, "*n"]) -> Float[Array, "*n"]:
     """Computes the scale of a pair's force where one of the two has this many contacts.
 
     N springs and dampers on one car add up to N times what the explicit integrator must carry: 16 cars at one position became NaN within a

@@ -14,6 +14,8 @@ from scenefactory_jax.dynamics import collision
 from scenefactory_jax.dynamics.articulated import articulated_car
 from scenefactory_jax.dynamics.articulated.actuators import Command, PlanarForce
 
+pytestmark = pytest.mark.usefixtures("quickly")
+
 
 def mix(matrix, vector, place, chosen):
     """Uses every way in which `scalars` arranges elements."""
@@ -102,7 +104,7 @@ def draw_cars(count):
     return step, (carry, command, PlanarForce(1000.0 * normal(2), 500.0 * normal()), 0.7 + 0.2 * jnp.tanh(normal(4)))
 
 
-def draw_pairs(count, *, limited):
+def draw_pairs(count):
     """The force between two boxes, and boxes of which some touch."""
     key = iter(jax.random.split(jax.random.key(2), 20))
     normal = lambda *shape: jax.random.normal(next(key), (count, *shape))  # noqa: E731
@@ -112,7 +114,7 @@ def draw_pairs(count, *, limited):
         return Boxes(1.5 * normal(2), 0.1 * normal(), 2.0 * normal(), 8.0 * normal(2), normal(), size, mass, normal() > -2.0)
 
     law = collision.ContactLaw(stiffness=1.2e5, dissipation=1.0, friction=0.3, mass=1980.0, momentum_transfer_s=0.1, max_neighbours=4)
-    step = functools.partial(collision.compute_pair_force, limited=limited, law=law, height=1.0, step_s=1 / 120)
+    step = functools.partial(collision.compute_pair_force, limited=True, law=law, height=1.0, step_s=1 / 120)
     return step, (jax.random.randint(next(key), (count,), -1, 8), draw(), draw())
 
 
@@ -130,18 +132,16 @@ def test_the_step_of_a_car_is_one_of_single_numbers():
     assert 20 < int((after.tyres.normal == 0.0).sum()) < 200  # of 256 tyres: some are in the air
 
 
-@pytest.mark.parametrize("limited", [False, True])
-def test_a_contact_of_two_boxes_is_one_of_single_numbers(limited):
-    _, force, *_ = check_elements(*draw_pairs(400, limited=limited))
+def test_the_force_between_two_boxes_is_one_of_single_numbers():
+    _, force, *_ = check_elements(*draw_pairs(400))
     assert int((jnp.abs(force).sum(1) > 0.0).sum()) > 20  # pairs that touch
 
 
-@pytest.mark.parametrize("name", ["step_car", "touch_cars"])
-def test_physics_is_lowered_to_kernels(name, monkeypatch):
-    """Triton knows all that the functions do, and has one kernel for the cars of all worlds."""
-    step, inputs = (draw_cars if name == "step_car" else functools.partial(draw_pairs, limited=False))(60)
+def test_the_step_is_lowered_to_one_kernel_of_all_cars(monkeypatch):
+    """Triton knows all that the step does."""
+    step, inputs = draw_cars(60)
     batches = jax.tree.map(lambda leaf: leaf.reshape(3, 20, *leaf.shape[1:]), inputs)
     monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
-    program = jax.jit(jax.vmap(functools.partial(lanes.map_cases, step, name=name))).trace(*batches)
+    program = jax.jit(jax.vmap(functools.partial(lanes.map_cases, step, name="step_car"))).trace(*batches)
     text = program.lower(lowering_platforms=("cuda",)).as_text()
-    assert text.count("__gpu$xla.gpu.triton") == 1 and name in text
+    assert text.count("__gpu$xla.gpu.triton") == 1 and "step_car" in text
