@@ -139,14 +139,14 @@ class Weather:
 class Boxes:
     """Oriented boxes on the road at one time: cars, and what they can hit."""
 
-    position: Float[Array, "*boxes 2"]
-    elevation: Float[Array, "*boxes"]  # of the boxes' centres
-    yaw: Float[Array, "*boxes"]
-    velocity: Float[Array, "*boxes 2"]
-    yaw_rate: Float[Array, "*boxes"]
-    size: Float[Array, "*boxes 2"]  # length, width
-    mass: Float[Array, "*boxes"]  # inf: immovable
-    present: Bool[Array, "*boxes"]
+    position: Float[Array, "B 2"]
+    elevation: Float[Array, " B"]  # of the boxes' centres
+    yaw: Float[Array, " B"]
+    velocity: Float[Array, "B 2"]
+    yaw_rate: Float[Array, " B"]
+    size: Float[Array, "B 2"]  # length, width
+    mass: Float[Array, " B"]  # inf: immovable
+    present: Bool[Array, " B"]
 
 
 @pytree_dataclass

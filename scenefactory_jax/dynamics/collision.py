@@ -158,10 +158,7 @@ def find_neighbours(cars: Boxes, traffic: Boxes, *, max_neighbours: int) -> Neig
 
 def advance_boxes(boxes: Boxes, seconds: float | Float[Array, ""]) -> Boxes:
     """Moves neighbours `[A, K, ...]` with constant velocities."""
-
-    def move(box: Boxes) -> Boxes:
-        return replace(box, position=box.position + box.velocity * seconds, yaw=box.yaw + box.yaw_rate * seconds)
-
+    move = lambda box: replace(box, position=box.position + box.velocity * seconds, yaw=box.yaw + box.yaw_rate * seconds)  # noqa: E731
     return jax.vmap(move)(boxes)
 
 
@@ -193,8 +190,9 @@ def compute_forces(
     operands = *axes, _sanitize(cars, law.mass), jax.vmap(functools.partial(_sanitize, mass=law.mass))(neighbours.boxes)
     plain = functools.partial(add_pairs, **both)
     quick = functools.partial(contact_kernel.compute_forces, scale_of_many=scale_of_many, **both)
-    fits = kernels and neighbours.rows.shape[1] and jax.default_backend() == "gpu"
-    cars_axis, beside_axis, force, torque, largest = dispatch(quick, plain, *operands) if fits else plain(*operands)
+    if kernels and neighbours.rows.shape[1] and jax.default_backend() == "gpu":
+        plain = functools.partial(dispatch, quick, plain)
+    cars_axis, beside_axis, force, torque, largest = plain(*operands)
     return Axes(cars_axis, beside_axis), force, torque, largest
 
 
@@ -253,11 +251,10 @@ def compute_pair_force(
     separation = compute_separation(first, second)
     axis = select_axis(separation, axis)
     begin, touches = find_begin(separation, axis, step_s=step_s)
-    first, second = (replace(box, position=box.position + begin * box.velocity) for box in (first, second))
-    normal, points, depths = find_contact_points(axis, first, second)
+    normal, points, depths = find_contact_points(axis, first, second, begin)
     near = touches & first.present & second.present & (jnp.abs(first.elevation - second.elevation) < height)
 
-    arm_first, arm_second = points - first.position, points - second.position
+    arm_first, arm_second = points - (first.position + begin * first.velocity), points - (second.position + begin * second.velocity)
     speed = _velocity_at(arm_second, second.velocity, second.yaw_rate) - _velocity_at(arm_first, first.velocity, first.yaw_rate)
     tangent = _rotate_90(normal)
     closing = -dot(speed, normal)
@@ -345,11 +342,12 @@ def find_begin(separation: Separation, axis: Int[Array, ""], *, step_s: float) -
     return begin, (begin < step_s) & jnp.all((beside < 0.0) | chosen)
 
 
-def find_contact_points(axis: Int[Array, ""], first: Boxes, second: Boxes) -> BoxContact:
-    """Computes the contact points of two boxes whose reference face has the axis `axis` (see `ContactState`)."""
+def find_contact_points(axis: Int[Array, ""], first: Boxes, second: Boxes, begin: Float[Array, ""]) -> BoxContact:
+    """Computes the contact points of two boxes at `begin`, s; their reference face has the axis `axis` (see `ContactState`)."""
     best, sign = axis // 2, 1.0 - 2.0 * (axis % 2)
     axes, other_axes = _axes(first.yaw), _axes(second.yaw)
-    gap, half, other_half = second.position - first.position, first.size / 2.0, second.size / 2.0
+    place, other_place = (box.position + begin * box.velocity for box in (first, second))
+    gap, half, other_half = other_place - place, first.size / 2.0, second.size / 2.0
     normal = jnp.concatenate([axes, other_axes])[best] * sign
 
     # the box of the axis has the reference face, the other box touches it with its nearest ("incident") face
@@ -372,14 +370,14 @@ def find_contact_points(axis: Int[Array, ""], first: Boxes, second: Boxes) -> Bo
     ends = jnp.clip(jnp.stack([low, high]), -1.0, 1.0)
     points = middle + ends[:, None] * along_face
     depths = front - points @ outward
-    points = points + 0.5 * depths[:, None] * outward + pick(first.position, second.position)
+    points = points + 0.5 * depths[:, None] * outward + pick(place, other_place)
     return BoxContact(normal=normal, points=points, depths=depths)
 
 
 def find_box_contact(first: Boxes, second: Boxes) -> BoxContact:
     """Computes the contact points of two boxes at this moment; depths are not positive if they do not overlap."""
     separation = compute_separation(first, second)
-    contact = find_contact_points(select_axis(separation, jnp.int32(NO_AXIS)), first, second)
+    contact = find_contact_points(select_axis(separation, jnp.int32(NO_AXIS)), first, second, jnp.float32(0.0))
     overlap = jnp.all(separation.gap < 0.0)
     return contact._replace(depths=jnp.where(overlap, contact.depths, jnp.minimum(contact.depths, 0.0)))
 

@@ -85,18 +85,11 @@ def compute_forces(
         cars = find(CARS, (i, j), own, (j,), (count, count))
         i, k = _number_lanes(count, objects)
         near = find(OBJECTS, (i, k), others, (i, k), (count, objects))
-        contacts = jnp.sum(cars.touch(), axis=0) + jnp.sum(cars.touch(), axis=1) + jnp.sum(near.touch(), axis=1)
-        cars = cars.scale(scale_of_many(jnp.maximum(contacts[:, None], contacts[None, :])))
-        near = near.scale(scale_of_many(contacts)[:, None])
-
-        row = jnp.arange(len(contacts), dtype=jnp.int32)
-        store = lambda at, numbers: plgpu.store(at, numbers, mask=row < count)  # noqa: E731
-        for column in range(2):
-            total = jnp.sum(cars[column], axis=0) - jnp.sum(cars[column], axis=1) - jnp.sum(near[column], axis=1)
-            store(force.at[row, column], total)
-        store(torque.at[row], jnp.sum(cars.first, axis=1) + jnp.sum(cars.second, axis=0) + jnp.sum(near.first, axis=1))
-        strongest = jnp.maximum(jnp.max(cars.strength(), axis=0), jnp.max(cars.strength(), axis=1))
-        store(largest.at[row], jnp.maximum(strongest, jnp.max(near.strength(), axis=1)))
+        total, turned, strongest = add_up(cars, near, scale_of_many)
+        row = jnp.arange(len(turned), dtype=jnp.int32)
+        places = force.at[row, 0], force.at[row, 1], torque.at[row], largest.at[row]
+        for place, numbers in zip(places, (*total, turned, strongest), strict=True):
+            plgpu.store(place, numbers, mask=row < count)
 
     floats = [jax.ShapeDtypeStruct(shape, jnp.float32) for shape in ((count, 2), (count,), (count,))]
     results = [jax.ShapeDtypeStruct(axis.shape, axis.dtype) for axis in (cars_axis, beside_axis)] + floats
@@ -111,6 +104,17 @@ def compute_forces(
         interpret=interpret,
         name="touch_boxes",
     )(*operands))  # fmt: skip
+
+
+def add_up(cars: Pairs, near: Pairs, scale_of_many: Callable[[Array], Array]) -> tuple[list[Array], Array, Array]:
+    """Adds up what each car feels: force along x and y, torque, and the largest force of a single pair."""
+    contacts = jnp.sum(cars.touch(), axis=0) + jnp.sum(cars.touch(), axis=1) + jnp.sum(near.touch(), axis=1)
+    cars = cars.scale(scale_of_many(jnp.maximum(contacts[:, None], contacts[None, :])))
+    near = near.scale(scale_of_many(contacts)[:, None])
+    force = [jnp.sum(car, axis=0) - jnp.sum(car, axis=1) - jnp.sum(other, axis=1) for car, other in ((cars.x, near.x), (cars.y, near.y))]
+    torque = jnp.sum(cars.first, axis=1) + jnp.sum(cars.second, axis=0) + jnp.sum(near.first, axis=1)
+    strongest = jnp.maximum(jnp.max(cars.strength(), axis=0), jnp.max(cars.strength(), axis=1))
+    return force, torque, jnp.maximum(strongest, jnp.max(near.strength(), axis=1))
 
 
 def _number_lanes(rows: int, columns: int) -> tuple[Int[Array, "A B"], Int[Array, "A B"]]:

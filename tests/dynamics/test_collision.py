@@ -511,7 +511,8 @@ def draw_worlds(worlds, count, objects):
         normal = lambda *tail: rng.normal(size=(worlds, *many, *tail)).astype(np.float32)  # noqa: E731
         size, mass = [4.0, 2.0] + 0.3 * np.abs(normal(2)), 1900.0 + 100.0 * normal()
         parts = 4.0 * normal(2), 0.1 * normal(), 2.0 * normal(), 8.0 * normal(2), normal(), size, mass, normal() > -1.5
-        return Boxes(*(jnp.asarray(part, bool if part.dtype == bool else jnp.float32) for part in parts))
+        make = functools.reduce(lambda make, _: jax.vmap(make), many, Boxes)  # boxes have one axis
+        return make(*(jnp.asarray(part, bool if part.dtype == bool else jnp.float32) for part in parts))
 
     axes = (jnp.asarray(rng.integers(-1, 8, (worlds, count, many)), jnp.int32) for many in (count, objects))
     return *axes, draw(count), draw(count, objects)
