@@ -55,10 +55,13 @@ def test_values_read_back_as_they_were():
 @pytest.mark.parametrize("protocol", ["vmax", "nuplan", "scenarionet", "recorded", "route100"])
 @pytest.mark.parametrize("experiment", ["vmax", "scenarionet"])
 def test_no_start_or_goal_is_out_of_bounds(experiment, protocol):
-    """Cars end where the square ends in which starts and goals lie, in training and in every protocol."""
+    """Cars end where the square ends in which starts and goals lie, in training and in every protocol; in one 10 m behind it."""
     trained = hydra_config.load_config("train", f"experiment={experiment}")
-    for config in (trained, hydra_config.apply_overrides(trained, overrides_of(protocol))):
-        assert config["step_metrics"]["scene_size_m"] == config["scenes"]["pack"]["scene_size_m"]
+    for config, beyond in (
+        (trained, 0.0),
+        (hydra_config.apply_overrides(trained, overrides_of(protocol)), 20.0 * (protocol == "route100")),
+    ):
+        assert config["step_metrics"]["scene_size_m"] == config["scenes"]["pack"]["scene_size_m"] + beyond
     narrow = hydra_config.load_config("train", f"experiment={experiment}", "scenes.pack.scene_size_m=150")
     assert narrow["step_metrics"]["scene_size_m"] == 150
 
