@@ -13,6 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.experimental import pallas as pl
 from jax.experimental.pallas import triton as plgpu
+from jax.extend.core import ClosedJaxpr
 from jaxtyping import Array
 
 from scenefactory_jax.core import pallas, scalars
@@ -30,15 +31,15 @@ def map_cases(function: Callable[..., Any], *operands: Any, name: str, enable: b
         enable: false: `vmap` everywhere.
         interpret: run the kernel on any device, slowly.
     """
-    if not interpret and not (enable and jax.default_backend() == "gpu"):  # tracing a long function for a kernel takes seconds
+    if not interpret and not (enable and pallas.on_gpu_by_default()):
         return jax.vmap(function)(*operands)
     leaves, tree = jax.tree.flatten(operands)
 
     def compute(*case: Array) -> Any:
         return function(*jax.tree.unflatten(tree, case))
 
-    result = jax.eval_shape(compute, *map(_drop_cases, leaves))
-    kernel = _join_batches(functools.partial(_call, compute, name=name, interpret=interpret))
+    closed, result = jax.make_jaxpr(compute, return_shape=True)(*map(_drop_cases, leaves))
+    kernel = _join_batches(functools.partial(_call, closed, name=name, interpret=interpret))
     plain = lambda *leaves: tuple(jax.tree.leaves(jax.vmap(compute)(*leaves)))  # noqa: E731
     results = kernel(*leaves) if interpret else pallas.dispatch(kernel, plain, *leaves)
     return jax.tree.unflatten(jax.tree.structure(result), results)
@@ -61,10 +62,8 @@ def _join_batches(call: Callable[..., tuple[Array, ...]]) -> Callable[..., tuple
     return joined
 
 
-def _call(function: Callable[..., Any], *leaves: Array, name: str, interpret: bool) -> tuple[Array, ...]:
-    examples, count = [*map(_drop_cases, leaves)], len(leaves[0])
-    results, run = jax.tree.leaves(jax.eval_shape(function, *examples)), scalars.unroll(function, *examples)
-    used = scalars.find_used(function, *examples)
+def _call(closed: ClosedJaxpr, *leaves: Array, name: str, interpret: bool) -> tuple[Array, ...]:
+    examples, results, count, used = [*map(_drop_cases, leaves)], closed.out_avals, len(leaves[0]), scalars.find_used(closed)
     read = [leaf.astype(stored(leaf.dtype)) for leaf, needed in zip(leaves, used, strict=True) if needed]
     written = [jax.ShapeDtypeStruct((count, *part.shape), stored(part.dtype)) for part in results]
 
@@ -75,7 +74,7 @@ def _call(function: Callable[..., Any], *leaves: Array, name: str, interpret: bo
             load(next(inputs), (rows,), inside, case) if needed else np.empty(case.shape, object)
             for case, needed in zip(examples, used, strict=True)
         ]
-        for reference, part in zip(inputs, run(*elements), strict=True):
+        for reference, part in zip(inputs, scalars.evaluate(closed, elements), strict=True):
             for place, element in np.ndenumerate(part):
                 plgpu.store(reference.at[(rows, *place)], jnp.broadcast_to(element, LANES).astype(reference.dtype), mask=inside)
 

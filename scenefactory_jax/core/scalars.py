@@ -1,4 +1,4 @@
-"""Evaluates a function with every element of its arrays as a value of its own.
+"""Evaluates a traced function with every element of its arrays as a value of its own.
 
 A kernel computes one case a lane: what is a number in the function becomes a vector of lanes, and an array of the function a NumPy array of
 such vectors. Slices, reshapes and concatenations then only sort these vectors while the kernel is traced, and Triton, which knows no small
@@ -19,21 +19,30 @@ Elements = np.ndarray
 """An array of dtype object: of vectors of lanes, or of NumPy numbers that are the same in all lanes."""
 
 
-def unroll(function: Callable[..., Any], *examples: Any) -> Callable[..., list[Elements]]:
-    """Makes a function of elements, an array of them for each leaf of the arguments, from one of arrays like `examples`.
+def evaluate(closed: jaxprs.ClosedJaxpr, leaves: Sequence[Elements]) -> list[Elements]:
+    """Evaluates a traced function (`jax.make_jaxpr`): an array of elements for each leaf of its arguments, and for each of its result.
 
-    It returns the elements of the leaves of the result. A product with a constant zero is zero: a NaN in its other factor is lost.
+    A product with a constant zero is zero: a NaN in its other factor is lost.
 
     Raises:
-        NotImplementedError: calling it, for an operation of JAX that mixes elements in a way that is not known here.
+        NotImplementedError: an operation of JAX that mixes elements in a way that is not known here.
     """
-    closed = jax.make_jaxpr(function)(*examples)
-    return lambda *leaves: _evaluate(closed.jaxpr, [list_elements(const) for const in closed.consts], leaves)
+    jaxpr, consts = closed.jaxpr, [list_elements(const) for const in closed.consts]
+    known = dict(zip([*jaxpr.constvars, *jaxpr.invars], [*consts, *leaves], strict=True))
+
+    def find(var: Any) -> Elements:
+        is_number = isinstance(var, jaxprs.Literal)
+        return list_elements(np.asarray(var.val, jax.numpy.result_type(var.aval))) if is_number else known[var]
+
+    for equation in jaxpr.eqns:
+        results = _apply(equation, [find(var) for var in equation.invars])
+        known.update(zip(equation.outvars, results, strict=True))
+    return [find(var) for var in jaxpr.outvars]
 
 
-def find_used(function: Callable[..., Any], *examples: Any) -> list[bool]:
-    """Finds the leaves of the arguments that the function reads."""
-    jaxpr = jax.make_jaxpr(function)(*examples).jaxpr
+def find_used(closed: jaxprs.ClosedJaxpr) -> list[bool]:
+    """Finds the leaves of the arguments that a traced function reads."""
+    jaxpr = closed.jaxpr
     read = {id(var) for equation in jaxpr.eqns for var in equation.invars} | {id(var) for var in jaxpr.outvars}
     return [id(var) in read for var in jaxpr.invars]
 
@@ -47,24 +56,11 @@ def list_elements(numbers: Any) -> Elements:
     return elements
 
 
-def _evaluate(jaxpr: Any, consts: Sequence[Elements], leaves: Sequence[Elements]) -> list[Elements]:
-    known = dict(zip([*jaxpr.constvars, *jaxpr.invars], [*consts, *leaves], strict=True))
-
-    def find(var: Any) -> Elements:
-        is_number = isinstance(var, jaxprs.Literal)
-        return list_elements(np.asarray(var.val, jax.numpy.result_type(var.aval))) if is_number else known[var]
-
-    for equation in jaxpr.eqns:
-        results = _apply(equation, [find(var) for var in equation.invars])
-        known.update(zip(equation.outvars, results, strict=True))
-    return [find(var) for var in jaxpr.outvars]
-
-
 def _apply(equation: Any, operands: list[Elements]) -> list[Elements]:
     name, params = equation.primitive.name, equation.params
     inner = params.get("jaxpr", params.get("call_jaxpr"))
     if inner is not None:  # a call
-        return _evaluate(inner.jaxpr, [list_elements(const) for const in inner.consts], operands)
+        return evaluate(inner, operands)
     if name in ARRANGING:
         return [ARRANGING[name](*operands, **params)]
     if name in REDUCING:

@@ -25,9 +25,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from scenefactory_jax.core import schema
+from scenefactory_jax.core import pallas, schema
 from scenefactory_jax.core.geometry import cross, dot, safe_norm
-from scenefactory_jax.core.pallas import dispatch
 from scenefactory_jax.core.pytree import is_finite, replace
 from scenefactory_jax.core.schema import Bounds, ConfigError, NonNegative, Positive
 from scenefactory_jax.core.types import Boxes, Motion
@@ -188,11 +187,11 @@ def compute_forces(
     touch = functools.partial(compute_pair_force, law=law, height=height, step_s=step_s)
     both = {"touch_car": functools.partial(touch, limited=False), "touch_object": functools.partial(touch, limited=True)}
     operands = *axes, _sanitize(cars, law.mass), jax.vmap(functools.partial(_sanitize, mass=law.mass))(neighbours.boxes)
-    plain = functools.partial(add_pairs, **both)
-    quick = functools.partial(contact_kernel.compute_forces, scale_of_many=scale_of_many, **both)
-    if kernels and neighbours.rows.shape[1] and jax.default_backend() == "gpu":
-        plain = functools.partial(dispatch, quick, plain)
-    cars_axis, beside_axis, force, torque, largest = plain(*operands)
+    add_all = functools.partial(add_pairs, **both)
+    if kernels and neighbours.rows.shape[1] and pallas.on_gpu_by_default():
+        kernel = functools.partial(contact_kernel.compute_forces, scale_of_many=scale_of_many, **both)
+        add_all = functools.partial(pallas.dispatch, kernel, add_all)
+    cars_axis, beside_axis, force, torque, largest = add_all(*operands)
     return Axes(cars_axis, beside_axis), force, torque, largest
 
 

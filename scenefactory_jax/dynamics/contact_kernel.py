@@ -64,7 +64,7 @@ def compute_forces(
     count, objects = beside_axis.shape
     box = jax.tree.map(lambda leaf: jax.ShapeDtypeStruct(leaf.shape[1:], leaf.dtype), cars)
     case, parts = jax.ShapeDtypeStruct((), jnp.int32), jax.tree.leaves(box)
-    runs = [scalars.unroll(touch, case, box, box) for touch in (touch_car, touch_object)]
+    traced = [jax.make_jaxpr(touch)(case, box, box) for touch in (touch_car, touch_object)]
     tables = [leaf.astype(lanes.stored(leaf.dtype)) for leaf in jax.tree.leaves((cars, beside))]
 
     def kernel(*references: Any) -> None:
@@ -77,7 +77,7 @@ def compute_forces(
             axis = lanes.load(axes[kind], at, inside, case)
             first = [lanes.load(table, at[:1], inside, part) for table, part in zip(own, parts, strict=True)]
             second = [lanes.load(table, place, inside, part) for table, part in zip(far, parts, strict=True)]
-            found, push, *turns = runs[kind](axis, *first, *second)
+            found, push, *turns = scalars.evaluate(traced[kind], [axis, *first, *second])
             plgpu.store(new_axes[kind].at[at], jnp.where(pair, found[()], axis[()]), mask=inside)
             return Pairs(*(jnp.where(pair, part, 0.0) for part in (*push, *(turn[()] for turn in turns))))
 

@@ -72,7 +72,7 @@ class CompiledCar(NamedTuple):
     rest_pose: np.ndarray  # qpos
     physics_dt: float
     substeps: int
-    kernels: bool
+    kernels: bool = False
 
 
 def make(
@@ -140,7 +140,6 @@ def compile_car(
         rest_pose=models.find_rest_pose(model, car),
         physics_dt=physics_dt,
         substeps=substeps,
-        kernels=False,
     )
 
 
