@@ -63,6 +63,8 @@ def _apply(equation: Any, operands: list[Elements]) -> list[Elements]:
         return evaluate(inner, operands)
     if name in ARRANGING:
         return [ARRANGING[name](*operands, **params)]
+    if name in DIVIDING:
+        return DIVIDING[name](*operands, **params)
     if name in REDUCING:
         axes = params["axes"]
         return [_reduce(REDUCING[name], np.moveaxis(operands[0], axes, range(len(axes))), count=len(axes))]
@@ -138,6 +140,11 @@ def _slice(x: Elements, *, start_indices: Sequence[int], limit_indices: Sequence
     return x[tuple(map(slice, start_indices, limit_indices, strides or [1] * x.ndim))]
 
 
+def _unstack(x: Elements, *, axis: int, **_: Any) -> list[Elements]:
+    parts = np.moveaxis(x, axis, 0)
+    return [parts[number, ...] for number in range(len(parts))]
+
+
 def _slice_from(x: Elements, *starts: Elements, slice_sizes: Sequence[int]) -> Elements:
     """`dynamic_slice`: each lane chooses among all slices. A start before the first is the first, one beyond the last is the last."""
     found = x
@@ -192,10 +199,14 @@ ARRANGING: dict[str, Callable[..., Elements]] = {  # what takes elements to othe
     "argmax": _find_largest,
     "dot_general": _multiply_matrices,
 }
+DIVIDING: dict[str, Callable[..., list[Elements]]] = {  # arrangements of several results
+    "split": lambda x, *, sizes, axis: np.split(x, np.cumsum(sizes)[:-1], axis),
+    "unstack": _unstack,
+}
 ELEMENTWISE = {
     "abs", "add", "and", "atan", "atan2", "ceil", "convert_element_type", "cos", "div", "eq", "exp", "exp2", "expm1", "floor", "ge",
-    "gt", "integer_pow", "is_finite", "le", "log", "log1p", "logistic", "lt", "max", "min", "mul", "ne", "neg", "not", "or", "pow",
-    "rem", "rsqrt", "select_n", "sign", "sin", "sqrt", "square", "sub", "tan", "tanh", "xor",
+    "gt", "integer_pow", "is_finite", "le", "log", "log1p", "log2", "logistic", "lt", "max", "min", "mul", "ne", "neg", "not",
+    "one_minus_square", "or", "pow", "rem", "rsqrt", "select_n", "sign", "sin", "sqrt", "square", "sub", "tan", "tanh", "xor",
 }  # fmt: skip
 REDUCING = {
     "reduce_sum": lax.add,

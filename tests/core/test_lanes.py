@@ -28,6 +28,8 @@ def mix(matrix, vector, place, chosen):
         "row": row.reshape(3, 1),
         "any": (counted & (row > 0.0)).any(),
         "sum": (0.0 + matrix).sum(0),
+        "columns": jnp.unstack(matrix, axis=1),
+        "parts": jnp.split(matrix, [1], axis=1),
     }
 
 
@@ -62,6 +64,20 @@ def test_more_cases_by_vmap_are_cases_of_one_kernel():
 
 def test_what_is_not_read_is_not_loaded():
     assert scalars.find_used(jax.make_jaxpr(lambda a, b, c: a + c)(1.0, 2.0, 3.0)) == [True, False, True]
+
+
+def test_an_operation_may_have_several_results():
+    """JAX 0.11 unpacks an array by `unstack`, earlier versions by slices."""
+
+    def unpack(vector):
+        first, *_, last = vector
+        row, other = jnp.unstack(vector.reshape(3, 2), axis=1)
+        return first - last, jnp.log2(row), other, *jnp.unstack(vector), *jnp.split(vector, [1, 4])
+
+    vector = np.array([4.0, 1.0, 2.0, 3.0, 8.0, 5.0], np.float32)
+    found = scalars.evaluate(jax.make_jaxpr(unpack)(vector), [scalars.list_elements(vector)])
+    for elements, expected in zip(found, unpack(jnp.asarray(vector)), strict=True):
+        np.testing.assert_allclose(elements.astype(np.float32), expected)
 
 
 @pytest.mark.parametrize("function", [jnp.sort, jnp.cumsum, lambda x: x[jnp.array([2, 0])][None] @ x.reshape(2, 2, 1)])
