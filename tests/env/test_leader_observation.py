@@ -1,4 +1,4 @@
-"""Observation group `leader`: two agents on one straight route, one on a crossing one, and boxes of the traffic."""
+"""Groups `leader` and `route_neighbours`: two agents on one straight route, one on a crossing one, and boxes of the traffic."""
 
 import jax
 import jax.numpy as jnp
@@ -7,14 +7,15 @@ import pytest
 from support.hand_scenes import scene_of
 from support.route_scenes import routed_scene
 
-from scenefactory_jax.adapters import bounds
+from scenefactory_jax.adapters import bounds, flatten_observation
 from scenefactory_jax.cli.hydra_config import load_config
 from scenefactory_jax.core.pytree import replace
 from scenefactory_jax.core.types import Boxes, Events, Motion, RouteState, State
 from scenefactory_jax.env import observations
 
-ENTRY = load_config("train", "observations=drive")["observations"]["leader"]
-GROUPS = observations.make({"leader": ENTRY})
+CONFIG = load_config("train", "observations=drive_crossings")["observations"]
+ENTRY, NEAR = CONFIG["leader"], CONFIG["crossings"]
+GROUPS = observations.make({"leader": ENTRY, "near": NEAR, "nearest": {**NEAR, "count": 1}})
 OBSERVE = jax.jit(lambda scene, state: observations.observe(scene, state, GROUPS))
 
 pytestmark = pytest.mark.usefixtures("quickly")
@@ -30,8 +31,8 @@ def boxes_of(*rows):
     return Boxes(table[:, :2], zero, table[:, 2], table[:, 3:], zero, jnp.tile(jnp.array([4.0, 2.0]), (len(table), 1)), zero, zero == 0)
 
 
-def observe(speeds, boxes, active=(True, True, True)):
-    """The leaders of agents at 10 and 30 m of the road east, and at 20 m of the road north."""
+def observe_all(speeds, boxes, active=(True, True, True)):
+    """What agents see at 10 and 30 m of the road east, and at 20 m of the road north."""
     scene = replace(routed_scene([EAST, EAST, NORTH], starts=[10.0, 30.0, 20.0]), traffic=boxes_of(*boxes))
     agents, zero = scene.agents, jnp.zeros(3)
     place = jnp.concatenate([agents.position, zero[:, None]], axis=1)
@@ -54,9 +55,13 @@ def observe(speeds, boxes, active=(True, True, True)):
     )
     seen = OBSERVE(scene, state)
     low, high = bounds.flat_bounds(GROUPS, seen)
-    flat = np.asarray(seen["leader"][0])
+    flat = np.asarray(flatten_observation(seen))
     assert (flat >= low).all() and (flat <= high).all()
-    return np.asarray(seen["leader"])
+    return jax.tree.map(np.asarray, seen)
+
+
+def observe(*args, **kwargs):
+    return observe_all(*args, **kwargs)["leader"]
 
 
 def test_the_nearest_box_on_the_route_leads():
@@ -88,4 +93,35 @@ def test_a_world_without_routes_has_no_leaders():
     parts = {"body": None, "motion": motion, "agents": scene.agents, "weather": routed.weather, "active": ~none}
     parts |= {"past_events": Events(*[none] * len(Events.__dataclass_fields__)), "steps_since_spawn": jnp.zeros(3, jnp.int32)}
     parts |= {"previous_action": jnp.zeros((3, 3)), "step": jnp.int32(0), "key": jax.random.key(0), "route": RouteState(zero, zero, none)}
-    np.testing.assert_array_equal(OBSERVE(scene, State(**parts))["leader"], [[0, 1, 0, 0]] * 3)
+    seen = OBSERVE(scene, State(**parts))
+    np.testing.assert_array_equal(seen["leader"], [[0, 1, 0, 0]] * 3)
+    assert not seen["near"].mask.any() and not seen["near"].features.any()
+
+
+def squash(value, scale):
+    return value / (scale + abs(value))
+
+
+def test_a_neighbour_that_crosses_the_route_says_where_and_who_is_first():
+    seen = observe_all([10.0, 0.0, 8.0], [], active=(True, False, True))["near"].features
+    length, time, across = NEAR["distance_scale_m"], NEAR["foresight_s"], squash(40.0, NEAR["offset_scale_m"])
+    there = squash(40.0, length)  # the roads cross 40 m ahead of both; one is there in 4 s, the other in 5
+    place, other = [1.0, there, -across, 1.0, 0.0, 0.0, 0.8], [1.0, there, across, -1.0, 0.0, 0.0, -1.0]
+    np.testing.assert_allclose(seen[0, 0, 3:10], place, atol=1e-5)
+    np.testing.assert_allclose(seen[2, 0], [0.8, 0.4, 0.0, *other, 1.0, there, time / (time + 4), time / (time + 5)], atol=1e-5)
+
+
+def test_neighbours_that_do_not_cross_in_time_or_at_all_have_no_crossing():
+    slow = observe_all([8.0, 0.0, 7.0], [], active=(True, False, True))["near"].features
+    assert slow[0, 0, 3] == 1.0 and not slow[0, 0, 10:].any()  # 5.7 s away
+    along = observe_all([8.0, 8.0, 0.0], [], active=(True, True, False))["near"].features
+    np.testing.assert_allclose(along[0, 0, 3:], [1.0, squash(20.0, 20.0), 0.0, 0.0, 1.0, 0.8, *[0.0] * 5], atol=1e-6)  # the one ahead
+
+
+def test_boxes_that_stand_beside_the_route_come_after_those_that_come():
+    parked, coming, ahead = (14.0, 6.0, 0.0, 0.0, 0.0), (60.0, 8.0, -np.pi / 2, 0.0, -3.0), (40.0, 0.0, 0.0, 0.0, 0.0)
+    seen = observe_all([8.0, 0.0, 0.0], [parked, coming], active=(True, False, False))
+    assert seen["nearest"].features[0, 0, 10] == 1.0
+    np.testing.assert_allclose(seen["nearest"].features[0, 0, 4], squash(50.0, 20.0), rtol=1e-5)
+    seen = observe_all([8.0, 0.0, 0.0], [parked, ahead], active=(True, False, False))["nearest"]
+    np.testing.assert_allclose(seen.features[0, 0, 4], squash(30.0, 20.0), rtol=1e-5)  # what stands on the route does not wait

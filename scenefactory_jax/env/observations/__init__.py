@@ -25,6 +25,7 @@ from scenefactory_jax.env.observations.noise_vector import noise
 from scenefactory_jax.env.observations.planning import planning
 from scenefactory_jax.env.observations.reward_vector import reward_weights
 from scenefactory_jax.env.observations.road_set import road
+from scenefactory_jax.env.observations.route_neighbours import route_neighbours
 from scenefactory_jax.env.observations.route_vector import route
 from scenefactory_jax.env.observations.state_vectors import ego, friction_ahead, grade_ahead, weather, yaw_rate_and_steer
 from scenefactory_jax.env.observations.vmax import vmax_base, vmax_lane, vmax_road, vmax_segment
@@ -43,6 +44,7 @@ __all__ += [
     "reward_weights",
     "road",
     "route",
+    "route_neighbours",
     "signs",
     "weather",
 ]  # groups

@@ -1,14 +1,13 @@
 """The vehicle ahead on the agent's own route as a vector."""
 
-import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from scenefactory_jax.core.geometry import safe_norm
 from scenefactory_jax.core.schema import Count, NonNegative, Positive
-from scenefactory_jax.core.types import Boxes, Scene, State
-from scenefactory_jax.dynamics.collision import collect_boxes
+from scenefactory_jax.core.types import Scene, State
 from scenefactory_jax.env import route_following
+from scenefactory_jax.env.observations.agent_routes import find_along_route, has_routes
 from scenefactory_jax.env.observations.column_bounds import ANY, FRACTION, LENGTH, SIGNED, bound_observation, compress_length
 from scenefactory_jax.env.traffic import corridor
 
@@ -39,14 +38,10 @@ def leader(
     """
     agents, motion = state.agents, state.motion
     free = jnp.zeros((len(state.active), COLUMNS), jnp.float32).at[:, 1].set(1.0)
-    if scene.routes.length.shape[0] == 0 or scene.routes.position.shape[1] < 2:
+    if not has_routes(scene):
         return free
-    cars = collect_boxes(motion, agents.size, state.active, jnp.inf)
-    boxes: Boxes = jax.tree.map(lambda *leaves: jnp.concatenate(leaves), cars, scene.traffic)
-    points = max(int(look_ahead_m // chord_m), 1) + 1
     arc = state.route.arc
-    window = corridor.read_window(scene.routes, agents.route, arc, points=points, stride=chord_m)
-    places = corridor.project_boxes(window, boxes)
+    boxes, _, places = find_along_route(scene, state, look_ahead_m=look_ahead_m, chord_m=chord_m)
     strip = {"arc": arc, "size": agents.size, "margin_m": margin_m, "foresight_s": jnp.full(len(boxes.mass), foresight_s)}
     found = corridor.find_obstacles(places, boxes, **strip, shift=jnp.zeros_like(places.offset))
     own = jnp.arange(len(boxes.mass)) == jnp.arange(len(arc))[:, None]

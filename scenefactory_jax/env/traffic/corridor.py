@@ -16,6 +16,7 @@ from scenefactory_jax.roadgraph.elevation import LEVEL_M
 
 AXLES = 0.6  # distance of the two places that carry a box, over its length: a car's wheelbase
 SHORTEST_M = 0.2  # a shorter chord lies behind the route's end
+CROSSING = 0.1  # sine of the smallest angle, 6 degrees, at which courses cross
 
 
 class Window(NamedTuple):
@@ -115,6 +116,39 @@ def find_extents(places: Projection, boxes: Boxes) -> tuple[Float[Array, "V B"],
     """Finds half the extents of boxes across and along routes."""
     half, sine, cosine = 0.5 * boxes.size[None], jnp.abs(places.sine), jnp.abs(places.cosine)
     return sine * half[..., 0] + cosine * half[..., 1], cosine * half[..., 0] + sine * half[..., 1]
+
+
+class Crossings(NamedTuple):
+    """Where straight courses of others first cross the routes of vehicles."""
+
+    arc: Float[Array, "V N"]  # along the route; inf: they do not
+    time: Float[Array, "V N"]  # s until the other's centre is there; inf
+
+
+def find_crossings(
+    window: Window,
+    position: Float[Array, "V N 2"],
+    velocity: Float[Array, "V N 2"],
+    elevation: Float[Array, "V N"],
+    *,
+    arc: Float[Array, " V"],
+    foresight_s: float,
+) -> Crossings:
+    """Finds the first place of each route from `arc` on that the centre of another passes within `foresight_s` at its present velocity."""
+    start, along = window.point[:, None, :-1], (window.point[:, 1:] - window.point[:, :-1])[:, None]  # [V, 1, K-1, 2]
+    apart, velocity = start - position[:, :, None], velocity[:, :, None]
+    angle = cross(velocity, along)
+    steep = jnp.abs(angle) > CROSSING * safe_norm(velocity) * safe_norm(along)
+    angle = jnp.where(steep, angle, 1.0)
+    time, part = cross(apart, along) / angle, cross(apart, velocity) / angle
+    place = window.arc[:, None, :-1] + part * safe_norm(along)
+    found = steep & (time >= 0.0) & (time <= foresight_s) & (part >= 0.0) & (part <= 1.0) & (place >= arc[:, None, None])
+    if window.height is not None:
+        found &= jnp.abs(window.height[:, None, :-1] - elevation[..., None]) < LEVEL_M
+    place = jnp.where(found, place, jnp.inf)
+    first = jnp.argmin(place, axis=2)[..., None]
+    nearest, time = (jnp.take_along_axis(table, first, axis=2)[..., 0] for table in (place, time))
+    return Crossings(nearest, jnp.where(jnp.isfinite(nearest), time, jnp.inf))
 
 
 def find_side_step(

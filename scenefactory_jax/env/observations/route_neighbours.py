@@ -1,0 +1,90 @@
+"""The nearest others along the agent's own route as a set of rows: where they are, and where and when they cross it."""
+
+import jax
+import jax.numpy as jnp
+
+from scenefactory_jax.core.geometry import SMALLEST, dot, safe_norm
+from scenefactory_jax.core.schema import Count, NonNegative, Positive
+from scenefactory_jax.core.types import Boxes, Scene, SetObservation, State
+from scenefactory_jax.env import route_following
+from scenefactory_jax.env.observations.agent_routes import find_along_route, has_routes
+from scenefactory_jax.env.observations.column_bounds import (
+    ANY,
+    FRACTION,
+    LENGTH,
+    SIGNED,
+    bound_observation,
+    compress_length,
+    pad_rows,
+)
+from scenefactory_jax.env.traffic import corridor
+
+COLUMNS = (LENGTH, LENGTH, ANY, FRACTION, SIGNED, SIGNED, SIGNED, SIGNED, ANY, ANY, FRACTION, SIGNED, FRACTION, FRACTION)
+LAST = 1e8  # m^2: farther than all that a scene holds
+
+
+@bound_observation(*COLUMNS)
+def route_neighbours(
+    scene: Scene,
+    state: State,
+    *,
+    count: Count,
+    look_ahead_m: Positive,
+    chord_m: Count,
+    standing_mps: NonNegative,
+    beside_m: Positive,
+    foresight_s: Positive,
+    distance_scale_m: Positive,
+    offset_scale_m: Positive,
+    size_scale_m: Positive,
+    speed_scale_mps: Positive,
+    turn_scale_radps: Positive,
+) -> SetObservation:
+    """The nearest other active cars and boxes as they lie to the agent's own route, and who is first where their ways cross.
+
+    An encoder of rows sees one other at a time and not the route; here the row says it. Columns: length, width, yaw rate; 1 if the other
+    lies beside the route ahead, the length along the route to its centre, its offset from the route to the left, sine and cosine of its
+    heading to the route's, its speed along the route and to the left; 1 if it crosses the route at its present velocity within
+    `foresight_s`, the length along the route to that place, the time t until it is there, and until the agent is at its own present speed,
+    both as foresight / (foresight + t). Lengths l read l / (scale + |l|). Zeros for what does not hold; no rows without a route.
+
+    Those that stand, more than `beside_m` from the route or not beside it at all, come after all others: parked cars do not take the rows
+    of cars that come.
+    """
+    agents, motion, arc = state.agents, state.motion, state.route.arc
+    users = len(arc) + len(scene.traffic.present)
+    others = route_following.find_routed(scene, agents)[:, None] & ~jnp.eye(len(arc), users, dtype=bool)
+    if not has_routes(scene):
+        return pad_rows(jnp.zeros((*others.shape, len(COLUMNS)))[:, :count], jnp.zeros_like(others)[:, :count], count)
+    boxes, window, places = find_along_route(scene, state, look_ahead_m=look_ahead_m, chord_m=chord_m)
+    apart = boxes.position - motion.position[:, None, :2]
+    waits = (safe_norm(boxes.velocity) < standing_mps) & (~places.valid | (jnp.abs(places.offset) > beside_m))
+    distance = jnp.where(others & boxes.present, dot(apart, apart) + jnp.where(waits, LAST, 0.0), jnp.inf)
+    order = jnp.argsort(distance, axis=1)[:, :count]
+    distance, near = jax.tree.map(lambda table: jnp.take_along_axis(table, order, axis=1), (distance, places))
+    box: Boxes = jax.tree.map(lambda leaf: leaf[order], boxes)
+    reach = arc - 0.5 * agents.size[:, 0]  # what crosses behind the agent's middle touches it, too
+    crossing = corridor.find_crossings(window, box.position, box.velocity, box.elevation, arc=reach, foresight_s=foresight_s)
+    place = [
+        jnp.ones_like(near.arc),
+        compress_length(near.arc - arc[:, None], distance_scale_m),
+        compress_length(near.offset, offset_scale_m),
+        near.sine,
+        near.cosine,
+        near.speed / speed_scale_mps,
+        near.drift / speed_scale_mps,
+    ]
+    away, own = crossing.arc - arc[:, None], foresight_s * safe_norm(motion.velocity[:, :2])[:, None]  # m
+    meeting = [
+        jnp.ones_like(away),
+        compress_length(away, distance_scale_m),
+        foresight_s / (foresight_s + crossing.time),
+        own / (own + jnp.maximum(away, SMALLEST)),
+    ]
+    columns = [
+        box.size / size_scale_m,
+        box.yaw_rate[..., None] / turn_scale_radps,
+        jnp.where(near.valid[..., None], jnp.stack(place, axis=-1), 0.0),
+        jnp.where(jnp.isfinite(away)[..., None], jnp.stack(meeting, axis=-1), 0.0),
+    ]
+    return pad_rows(jnp.concatenate(columns, axis=-1), jnp.isfinite(distance), count)
