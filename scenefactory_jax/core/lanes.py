@@ -5,7 +5,9 @@ computed in registers and written once.
 """
 
 import functools
-from collections.abc import Callable
+import itertools
+import math
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import jax
@@ -13,12 +15,13 @@ import jax.numpy as jnp
 import numpy as np
 from jax.experimental import pallas as pl
 from jax.experimental.pallas import triton as plgpu
-from jax.extend.core import ClosedJaxpr
+from jax.extend.core import ClosedJaxpr, Jaxpr, JaxprEqn, Var
 from jaxtyping import Array
 
 from scenefactory_jax.core import pallas, scalars
 
 LANES, WARPS = 32, 1  # of a program: few, so that few cases already use all processors
+PIECE = 100  # operations in one loop: see `_compute_in_pieces`
 
 
 def map_cases(function: Callable[..., Any], *operands: Any, name: str, enable: bool = True, interpret: bool = False) -> Any:
@@ -39,10 +42,28 @@ def map_cases(function: Callable[..., Any], *operands: Any, name: str, enable: b
         return function(*jax.tree.unflatten(tree, case))
 
     closed, result = jax.make_jaxpr(compute, return_shape=True)(*map(_drop_cases, leaves))
-    kernel = _join_batches(functools.partial(_call, closed, name=name, interpret=interpret))
+    kernel = _join_batches(functools.partial(_call, closed, _trace_lanes(closed), name=name, interpret=interpret))
     plain = lambda *leaves: tuple(jax.tree.leaves(jax.vmap(compute)(*leaves)))  # noqa: E731
     results = kernel(*leaves) if interpret else pallas.dispatch(kernel, plain, *leaves)
     return jax.tree.unflatten(jax.tree.structure(result), results)
+
+
+def _trace_lanes(closed: ClosedJaxpr) -> ClosedJaxpr:
+    """Traces the function of one case as one of lanes: its arguments and results are a vector for each element that is used."""
+    used, cases = scalars.find_used(closed), _choose_used(closed, closed.in_avals)
+
+    def compute(*vectors: Array) -> list[Array]:
+        rest = iter(vectors)
+        known = iter([scalars.arrange([next(rest) for _ in range(math.prod(case.shape))], case.shape) for case in cases])
+        found = scalars.evaluate(closed, [next(known) if is_used else np.empty(0, object) for is_used in used])
+        parts = [(part, stored(like.dtype)) for part, like in zip(found, closed.out_avals, strict=True)]
+        return [jnp.broadcast_to(element, LANES).astype(dtype) for part, dtype in parts for element in part.flat]
+
+    return jax.make_jaxpr(compute)(*(jax.ShapeDtypeStruct((LANES,), case.dtype) for case in cases for _ in range(math.prod(case.shape))))
+
+
+def _choose_used(closed: ClosedJaxpr, arguments: Sequence[Any]) -> list[Any]:
+    return list(itertools.compress(arguments, scalars.find_used(closed)))
 
 
 def _drop_cases(leaf: Any) -> jax.ShapeDtypeStruct:
@@ -62,21 +83,18 @@ def _join_batches(call: Callable[..., tuple[Array, ...]]) -> Callable[..., tuple
     return joined
 
 
-def _call(closed: ClosedJaxpr, *leaves: Array, name: str, interpret: bool) -> tuple[Array, ...]:
-    examples, results, count, used = [*map(_drop_cases, leaves)], closed.out_avals, len(leaves[0]), scalars.find_used(closed)
-    read = [leaf.astype(stored(leaf.dtype)) for leaf, needed in zip(leaves, used, strict=True) if needed]
-    written = [jax.ShapeDtypeStruct((count, *part.shape), stored(part.dtype)) for part in results]
+def _call(closed: ClosedJaxpr, operations: ClosedJaxpr, *leaves: Array, name: str, interpret: bool) -> tuple[Array, ...]:
+    count, needed = len(leaves[0]), _choose_used(closed, leaves)
+    cases, read = [*map(_drop_cases, needed)], [leaf.astype(stored(leaf.dtype)) for leaf in needed]
+    written = [jax.ShapeDtypeStruct((count, *part.shape), stored(part.dtype)) for part in closed.out_avals]
 
     def kernel(*references: Any) -> None:
         rows = pl.program_id(0) * LANES + jnp.arange(LANES, dtype=jnp.int32)
-        inside, inputs = rows < count, iter(references)
-        elements = [
-            load(next(inputs), (rows,), inside, case) if needed else np.empty(case.shape, object)
-            for case, needed in zip(examples, used, strict=True)
-        ]
-        for reference, part in zip(inputs, scalars.evaluate(closed, elements), strict=True):
-            for place, element in np.ndenumerate(part):
-                plgpu.store(reference.at[(rows, *place)], jnp.broadcast_to(element, LANES).astype(reference.dtype), mask=inside)
+        inside, inputs, outputs = rows < count, references[: len(read)], references[len(read) :]
+        vectors = [x for reference, case in zip(inputs, cases, strict=True) for x in load(reference, (rows,), inside, case).flat]
+        places = [reference.at[(rows, *place)] for reference in outputs for place in np.ndindex(*reference.shape[1:])]
+        for place, vector in zip(places, _compute_in_pieces(operations, vectors), strict=True):
+            plgpu.store(place, vector, mask=inside)
 
     found = pl.pallas_call(
         kernel,
@@ -88,7 +106,44 @@ def _call(closed: ClosedJaxpr, *leaves: Array, name: str, interpret: bool) -> tu
         interpret=interpret,
         name=name,
     )(*read)
-    return tuple(part.astype(like.dtype) for part, like in zip(found, results, strict=True))
+    return tuple(part.astype(like.dtype) for part, like in zip(found, closed.out_avals, strict=True))
+
+
+def _compute_in_pieces(closed: ClosedJaxpr, vectors: Sequence[Array]) -> list[Array]:
+    """Computes a traced function of lanes, with a loop of one round around every few operations.
+
+    The loops are for Triton's compiler. Its pass `TritonGPUCoalesce` visits, for each access to memory, all operations that are connected
+    with it, and from each of these all that come before and after: with one long piece, minutes for the step of a car. What is in a loop it
+    does not connect with what reads the loop's results. Only the compiler after it, LLVM, knows that programs are not numbered below zero,
+    finds that there is one round, and leaves nothing of the loops.
+    """
+    jaxpr, one = closed.jaxpr, jnp.minimum(pl.program_id(0), 0) + 1
+    zeros = functools.cache(functools.partial(jnp.zeros, LANES))
+    known = dict(zip([*jaxpr.constvars, *jaxpr.invars], [*closed.consts, *vectors], strict=True))
+    for piece, results in _divide(jaxpr):
+        compute = functools.partial(_compute_piece, piece, results, known)
+        found = jax.lax.fori_loop(0, one, compute, [zeros(jnp.result_type(var.aval)) for var in results])
+        known |= zip(results, found, strict=True)
+    return [known[var] for var in jaxpr.outvars]
+
+
+def _divide(jaxpr: Jaxpr) -> list[tuple[list[JaxprEqn], list[Var]]]:
+    """Divides a function into pieces, each with those of its results that are read after it."""
+    pieces, read = [], set(jaxpr.outvars)
+    for start in reversed(range(0, len(jaxpr.eqns), PIECE)):
+        piece = jaxpr.eqns[start : start + PIECE]
+        pieces.append((piece, [var for equation in piece for var in equation.outvars if var in read]))
+        read |= {var for equation in piece for var in equation.invars if isinstance(var, Var)}
+    return pieces[::-1]
+
+
+def _compute_piece(piece: list[JaxprEqn], results: list[Var], known: dict[Var, Array], *_: Any) -> list[Array]:
+    """Computes `results`; the last arguments are a loop's."""
+    inside = dict(known)
+    for equation in piece:
+        operands = [inside[var] if isinstance(var, Var) else var.val for var in equation.invars]
+        inside[equation.outvars[0]] = equation.primitive.bind(*operands, **equation.params)
+    return [inside[var] for var in results]
 
 
 def stored(dtype: Any) -> Any:

@@ -7,7 +7,7 @@ or odd shapes, sees arithmetic alone.
 
 import functools
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
 import jax
@@ -50,9 +50,14 @@ def find_used(closed: jaxprs.ClosedJaxpr) -> list[bool]:
 def list_elements(numbers: Any) -> Elements:
     """Lists the numbers of an array, with its shape."""
     array = np.asarray(numbers)
-    elements = np.empty(array.shape, object)
-    for place in np.ndindex(array.shape):
-        elements[place] = array[place]
+    return arrange((array[place] for place in np.ndindex(array.shape)), array.shape)
+
+
+def arrange(values: Iterable[Any], shape: tuple[int, ...]) -> Elements:
+    """Makes an array of the elements of a shape, row by row."""
+    elements = np.empty(shape, object)
+    for place, value in zip(np.ndindex(shape), values, strict=True):
+        elements[place] = value
     return elements
 
 

@@ -153,6 +153,27 @@ def test_the_force_between_two_boxes_is_one_of_single_numbers():
     assert int((jnp.abs(force).sum(1) > 0.0).sum()) > 20  # pairs that touch
 
 
+def find_kernel(jaxpr):
+    """The operations of the only kernel in a program."""
+    for equation in jaxpr.eqns:
+        if equation.primitive.name == "pallas_call":
+            return equation.params["jaxpr"].eqns
+        for inner in equation.params.values():
+            if hasattr(inner, "jaxpr") and (found := find_kernel(inner.jaxpr)):
+                return found
+    return []
+
+
+def test_the_step_is_a_kernel_of_short_loops():
+    """What is one long piece Triton compiles for minutes."""
+    step, inputs = draw_cars(60)
+    kernel = find_kernel(jax.make_jaxpr(functools.partial(lanes.map_cases, step, name="step_car", interpret=True))(*inputs).jaxpr)
+    loops = [operation.params["body_jaxpr"].eqns for operation in kernel if operation.primitive.name == "while"]
+    assert len(loops) > 50 and max(map(len, loops)) <= lanes.PIECE + 1  # one more counts the rounds
+    outside = {operation.primitive.name for operation in kernel}
+    assert {"while", "masked_load", "masked_swap"} < outside and not outside & {"div", "sqrt", "select_n", "sin", "sub"}
+
+
 def test_the_step_is_lowered_to_one_kernel_of_all_cars(monkeypatch):
     """Triton knows all that the step does."""
     step, inputs = draw_cars(60)
