@@ -42,15 +42,16 @@ def map_cases(function: Callable[..., Any], *operands: Any, name: str, enable: b
         return function(*jax.tree.unflatten(tree, case))
 
     closed, result = jax.make_jaxpr(compute, return_shape=True)(*map(_drop_cases, leaves))
-    kernel = _join_batches(functools.partial(_call, closed, _trace_lanes(closed), name=name, interpret=interpret))
+    used = scalars.find_used(closed)
+    kernel = _join_batches(functools.partial(_call, _trace_lanes(closed, used), used, closed.out_avals, name=name, interpret=interpret))
     plain = lambda *leaves: tuple(jax.tree.leaves(jax.vmap(compute)(*leaves)))  # noqa: E731
     results = kernel(*leaves) if interpret else pallas.dispatch(kernel, plain, *leaves)
     return jax.tree.unflatten(jax.tree.structure(result), results)
 
 
-def _trace_lanes(closed: ClosedJaxpr) -> ClosedJaxpr:
+def _trace_lanes(closed: ClosedJaxpr, used: list[bool]) -> ClosedJaxpr:
     """Traces the function of one case as one of lanes: its arguments and results are a vector for each element that is used."""
-    used, cases = scalars.find_used(closed), _choose_used(closed, closed.in_avals)
+    cases = [*itertools.compress(closed.in_avals, used)]
 
     def compute(*vectors: Array) -> list[Array]:
         rest = iter(vectors)
@@ -60,10 +61,6 @@ def _trace_lanes(closed: ClosedJaxpr) -> ClosedJaxpr:
         return [jnp.broadcast_to(element, LANES).astype(dtype) for part, dtype in parts for element in part.flat]
 
     return jax.make_jaxpr(compute)(*(jax.ShapeDtypeStruct((LANES,), case.dtype) for case in cases for _ in range(math.prod(case.shape))))
-
-
-def _choose_used(closed: ClosedJaxpr, arguments: Sequence[Any]) -> list[Any]:
-    return list(itertools.compress(arguments, scalars.find_used(closed)))
 
 
 def _drop_cases(leaf: Any) -> jax.ShapeDtypeStruct:
@@ -83,10 +80,12 @@ def _join_batches(call: Callable[..., tuple[Array, ...]]) -> Callable[..., tuple
     return joined
 
 
-def _call(closed: ClosedJaxpr, operations: ClosedJaxpr, *leaves: Array, name: str, interpret: bool) -> tuple[Array, ...]:
-    count, needed = len(leaves[0]), _choose_used(closed, leaves)
+def _call(
+    operations: ClosedJaxpr, used: list[bool], results: Sequence[Any], *leaves: Array, name: str, interpret: bool
+) -> tuple[Array, ...]:
+    count, needed = len(leaves[0]), [*itertools.compress(leaves, used)]
     cases, read = [*map(_drop_cases, needed)], [leaf.astype(stored(leaf.dtype)) for leaf in needed]
-    written = [jax.ShapeDtypeStruct((count, *part.shape), stored(part.dtype)) for part in closed.out_avals]
+    written = [jax.ShapeDtypeStruct((count, *part.shape), stored(part.dtype)) for part in results]
 
     def kernel(*references: Any) -> None:
         rows = pl.program_id(0) * LANES + jnp.arange(LANES, dtype=jnp.int32)
@@ -106,7 +105,7 @@ def _call(closed: ClosedJaxpr, operations: ClosedJaxpr, *leaves: Array, name: st
         interpret=interpret,
         name=name,
     )(*read)
-    return tuple(part.astype(like.dtype) for part, like in zip(found, closed.out_avals, strict=True))
+    return tuple(part.astype(like.dtype) for part, like in zip(found, results, strict=True))
 
 
 def _compute_in_pieces(closed: ClosedJaxpr, vectors: Sequence[Array]) -> list[Array]:

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from support import driving
-from support.lowering import lower
+from support.abstract_gpu import abstract_gpu
 
 from scenefactory_jax.core import lanes, scalars
 from scenefactory_jax.core.types import Boxes
@@ -180,5 +180,7 @@ def test_the_step_is_lowered_to_one_kernel_of_all_cars(monkeypatch):
     step, inputs = draw_cars(60)
     batches = jax.tree.map(lambda leaf: leaf.reshape(3, 20, *leaf.shape[1:]), inputs)
     monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
-    text = lower(jax.jit(jax.vmap(functools.partial(lanes.map_cases, step, name="step_car"))), *batches)
+    with abstract_gpu():
+        program = jax.jit(jax.vmap(functools.partial(lanes.map_cases, step, name="step_car"))).trace(*batches)
+        text = program.lower(lowering_platforms=("cuda",)).as_text()
     assert text.count("__gpu$xla.gpu.triton") == 1 and "step_car" in text

@@ -7,8 +7,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import yaml
+from support.abstract_gpu import abstract_gpu
 from support.hand_scenes import column_of
-from support.lowering import lower
 from support.running import ROOT
 
 from scenefactory_jax.core import schema
@@ -544,5 +544,6 @@ def test_contacts_are_lowered_to_one_kernel(monkeypatch):
     for objects, kernels in ((4, 1), (0, 0)):
         axis, beside_axis, cars, boxes = draw_worlds(3, 16, objects)
         beside = collision.Neighbours(boxes, jnp.zeros((3, 16, objects), jnp.int32))
-        text = lower(jax.jit(jax.vmap(model.forces)), collision.Axes(axis, beside_axis), cars, beside)
-        assert text.count("__gpu$xla.gpu.triton") == kernels
+        with abstract_gpu():
+            program = jax.jit(jax.vmap(model.forces)).trace(collision.Axes(axis, beside_axis), cars, beside)
+            assert program.lower(lowering_platforms=("cuda",)).as_text().count("__gpu$xla.gpu.triton") == kernels

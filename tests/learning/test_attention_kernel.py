@@ -8,7 +8,6 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from support.abstract_gpu import abstract_gpu
-from support.lowering import lower
 
 from scenefactory_jax.env.observations.vmax import Block
 from scenefactory_jax.learning.networks import attention, attention_kernel, encoder_modules, residual, residual_kernel
@@ -131,7 +130,7 @@ def test_a_gpu_gets_kernels_and_other_devices_plain_jax(dtype):
             return residual.add(dtype, kernels, x, what, scale, weights).sum()
 
         with abstract_gpu():
-            return lower(jax.jit(jax.grad(loss)), scale, weights, platform=platform)
+            return jax.jit(jax.grad(loss)).trace(scale, weights).lower(lowering_platforms=(platform,)).as_text()
 
     on_gpu = text(True, "cuda")
     assert all(name in on_gpu for name in ("attend", "attend_gradient", "add_residual", "add_residual_gradient"))
@@ -149,5 +148,5 @@ def test_gpus_that_kernels_were_not_measured_on_get_plain_jax(capability, made, 
     parameters = jax.eval_shape(lambda key: one.init(key, {}), jax.random.key(0))
     with abstract_gpu():
         steep = jax.jit(jax.grad(lambda parameters: one.apply(parameters, {}).sum()))  # pyright: ignore[reportAttributeAccessIssue]
-        text = lower(steep, parameters)
+        text = steep.trace(parameters).lower(lowering_platforms=("cuda",)).as_text()
     assert [name in text for name in ("attend_gradient", "add_residual_gradient", "embed_rows_gradient")] == [made] * 3

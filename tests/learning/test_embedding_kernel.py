@@ -8,7 +8,6 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from support.abstract_gpu import abstract_gpu
-from support.lowering import lower
 
 from scenefactory_jax.learning.networks import embedding_kernel as kernel
 
@@ -74,7 +73,7 @@ def test_a_gpu_gets_kernels_in_half_precision_and_other_devices_plain_jax():
     def text(dtype, platform):
         loss = jax.jit(jax.grad(lambda weights: kernel.embed(dtype, weights, x).sum()))
         with abstract_gpu():
-            return lower(loss, weights, platform=platform)
+            return loss.trace(weights).lower(lowering_platforms=(platform,)).as_text()
 
     quick = text("bfloat16", "cuda")
     assert "embed_rows_gradient" in quick and "embed_rows_gradient_of_first" in quick

@@ -10,7 +10,6 @@ import pytest
 from support import encoding
 from support.abstract_gpu import abstract_gpu
 from support.encoding import ENTRIES, observe
-from support.lowering import lower
 from support.probes import AGENTS, ppo_config, probe, scenes
 
 from scenefactory_jax.cli import hydra_config as configs
@@ -152,7 +151,7 @@ def test_critics_lower_to_the_kernels_of_sets_on_a_gpu():
     parameters = jax.eval_shape(network.init, jax.random.key(0), OBSERVATION, ACTION)
     loss = jax.jit(jax.grad(lambda p: jnp.sum(network.apply(p, OBSERVATION, ACTION))))
     with abstract_gpu():
-        assert "encode_set_gradient" in lower(loss, parameters)
+        assert "encode_set_gradient" in loss.trace(parameters).lower(lowering_platforms=("cuda",)).as_text()
 
 
 def with_neighbours(env):

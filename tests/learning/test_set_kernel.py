@@ -7,7 +7,6 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from support.abstract_gpu import abstract_gpu
-from support.lowering import lower
 
 from scenefactory_jax.learning.networks import late_fusion, set_kernel
 
@@ -95,7 +94,7 @@ def test_a_gpu_gets_kernels_and_other_devices_plain_jax(dtype):
     def text(kernels, platform):
         loss = jax.jit(jax.grad(lambda weights: late_fusion.encode_set("elu", dtype, kernels, weights, x, mask).sum()))
         with abstract_gpu():
-            return lower(loss, weights, platform=platform)
+            return loss.trace(weights).lower(lowering_platforms=(platform,)).as_text()
 
     assert "encode_set" in text(True, "cuda") and "encode_set_gradient" in text(True, "cuda")
     assert "triton" not in text(True, "cpu") and "triton" not in text(False, "cuda")

@@ -5,7 +5,6 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from support.abstract_gpu import abstract_gpu
-from support.lowering import lower
 
 from scenefactory_jax.cli.hydra_config import load_config
 from scenefactory_jax.core import geometry
@@ -142,7 +141,7 @@ def test_a_gpu_gets_kernels_and_other_devices_plain_jax(scenes, cars):
             return segments, queries.query_road(scene, circles, radius, velocity, yaw, position, active, **EDGES, kernels=kernels)
 
         with abstract_gpu():
-            return lower(jax.jit(jax.vmap(both)), scenes, *cars, platform=platform)
+            return jax.jit(jax.vmap(both)).trace(scenes, *cars).lower(lowering_platforms=(platform,)).as_text()
 
     assert "query_road" in text(True, "cuda") and "gather_segments" in text(True, "cuda")
     assert "triton" not in text(True, "cpu") and "triton" not in text(False, "cuda")

@@ -11,4 +11,5 @@ def abstract_gpu():
     if not hasattr(jax.sharding, "AbstractDevice") or version("jaxlib") < "0.11":
         return contextlib.nullcontext()
     gpu = jax.sharding.AbstractDevice("NVIDIA H200", None, "cuda")
-    return jax.sharding.use_abstract_mesh(jax.sharding.AbstractMesh((1,), ("x",), abstract_device=gpu))
+    mesh = jax.sharding.AbstractMesh((), (), abstract_device=gpu)  # without axes: numbers that a trace computes at once need a real device
+    return jax.sharding.use_abstract_mesh(mesh)

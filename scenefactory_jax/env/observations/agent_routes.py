@@ -40,11 +40,6 @@ def sample_route_ahead(
     return points[route[:, None], jnp.minimum(index, points.shape[1] - 1)]
 
 
-def has_routes(scene: Scene) -> bool:
-    """Whether the scene has room for a route with a length."""
-    return scene.routes.length.shape[0] > 0 and scene.routes.position.shape[1] > 1
-
-
 def find_along_route(
     scene: Scene, state: State, *, look_ahead_m: float, chord_m: int
 ) -> tuple[Boxes, corridor.Window, corridor.Projection]:

@@ -7,7 +7,7 @@ from scenefactory_jax.core.geometry import safe_norm
 from scenefactory_jax.core.schema import Count, NonNegative, Positive
 from scenefactory_jax.core.types import Scene, State
 from scenefactory_jax.env import route_following
-from scenefactory_jax.env.observations.agent_routes import find_along_route, has_routes
+from scenefactory_jax.env.observations.agent_routes import find_along_route
 from scenefactory_jax.env.observations.column_bounds import ANY, FRACTION, LENGTH, SIGNED, bound_observation, compress_length
 from scenefactory_jax.env.traffic import corridor
 
@@ -38,7 +38,7 @@ def leader(
     """
     agents, motion = state.agents, state.motion
     free = jnp.zeros((len(state.active), COLUMNS), jnp.float32).at[:, 1].set(1.0)
-    if not has_routes(scene):
+    if not corridor.has_routes(scene.routes):
         return free
     arc = state.route.arc
     boxes, _, places = find_along_route(scene, state, look_ahead_m=look_ahead_m, chord_m=chord_m)

@@ -7,7 +7,7 @@ from scenefactory_jax.core.geometry import SMALLEST, dot, safe_norm
 from scenefactory_jax.core.schema import Count, NonNegative, Positive
 from scenefactory_jax.core.types import Boxes, Scene, SetObservation, State
 from scenefactory_jax.env import route_following
-from scenefactory_jax.env.observations.agent_routes import find_along_route, has_routes
+from scenefactory_jax.env.observations.agent_routes import find_along_route
 from scenefactory_jax.env.observations.column_bounds import (
     ANY,
     FRACTION,
@@ -54,7 +54,7 @@ def route_neighbours(
     agents, motion, arc = state.agents, state.motion, state.route.arc
     users = len(arc) + len(scene.traffic.present)
     others = route_following.find_routed(scene, agents)[:, None] & ~jnp.eye(len(arc), users, dtype=bool)
-    if not has_routes(scene):
+    if not corridor.has_routes(scene.routes):
         return pad_rows(jnp.zeros((*others.shape, len(COLUMNS)))[:, :count], jnp.zeros_like(others)[:, :count], count)
     boxes, window, places = find_along_route(scene, state, look_ahead_m=look_ahead_m, chord_m=chord_m)
     apart = boxes.position - motion.position[:, None, :2]

@@ -40,6 +40,11 @@ class Projection(NamedTuple):
     valid: Bool[Array, "V B"]  # the box lies beside the window, neither behind its beginning nor beyond its end
 
 
+def has_routes(routes: Routes) -> bool:
+    """Whether there is room for a route with a length."""
+    return routes.position.shape[0] > 0 and routes.position.shape[1] > 1
+
+
 def read_window(routes: Routes, route: Int[Array, " V"], arc: Float[Array, " V"], *, points: int, stride: int) -> Window:
     """Reads the routes from the point at or before `arc` on; `stride` counts the route's points."""
     count = routes.position.shape[1]
@@ -62,7 +67,7 @@ def project_boxes(window: Window, boxes: Boxes) -> Projection:
     counts, present = usable[:, None], None
     if window.height is not None:  # else a chord far ahead may be at the height of a box under the route
         beside = jnp.abs(beyond) <= 0.5 * boxes.size[None, :, :1]
-        counts = counts & beside & (jnp.abs(window.height[:, None, :-1] - boxes.elevation[:, None]) < LEVEL_M)
+        counts = counts & beside & _find_level(window.height, boxes.elevation)
         present = boxes.present & jnp.any(counts, axis=2)
     distance = jnp.where(counts, cross(direction[:, None], relative) ** 2 + beyond**2, jnp.inf)
     best = jnp.argmin(distance, axis=2)  # [V, B]
@@ -82,6 +87,11 @@ def project_boxes(window: Window, boxes: Boxes) -> Projection:
         drift=cross(ahead, boxes.velocity[None]),
         valid=(boxes.present[None] if present is None else present) & chord(usable) & (arc >= low - reach) & (arc <= high + reach),
     )
+
+
+def _find_level(height: Float[Array, "V K"], elevation: Float[Array, "*n B"]) -> Bool[Array, "V B K-1"]:
+    """Mask of the chords on the level of boxes."""
+    return jnp.abs(height[:, None, :-1] - elevation[..., None]) < LEVEL_M
 
 
 class Obstacles(NamedTuple):
@@ -137,14 +147,14 @@ def find_crossings(
     """Finds the first place of each route from `arc` on that the centre of another passes within `foresight_s` at its present velocity."""
     start, along = window.point[:, None, :-1], (window.point[:, 1:] - window.point[:, :-1])[:, None]  # [V, 1, K-1, 2]
     apart, velocity = start - position[:, :, None], velocity[:, :, None]
-    angle = cross(velocity, along)
-    steep = jnp.abs(angle) > CROSSING * safe_norm(velocity) * safe_norm(along)
+    angle, length = cross(velocity, along), safe_norm(along)
+    steep = jnp.abs(angle) > CROSSING * safe_norm(velocity) * length
     angle = jnp.where(steep, angle, 1.0)
     time, part = cross(apart, along) / angle, cross(apart, velocity) / angle
-    place = window.arc[:, None, :-1] + part * safe_norm(along)
+    place = window.arc[:, None, :-1] + part * length
     found = steep & (time >= 0.0) & (time <= foresight_s) & (part >= 0.0) & (part <= 1.0) & (place >= arc[:, None, None])
     if window.height is not None:
-        found &= jnp.abs(window.height[:, None, :-1] - elevation[..., None]) < LEVEL_M
+        found &= _find_level(window.height, elevation)
     place = jnp.where(found, place, jnp.inf)
     first = jnp.argmin(place, axis=2)[..., None]
     nearest, time = (jnp.take_along_axis(table, first, axis=2)[..., 0] for table in (place, time))

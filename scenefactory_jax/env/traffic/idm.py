@@ -100,7 +100,7 @@ def idm_traffic(
 def find_drivers(scene: Scene) -> Bool[Array, " O"]:
     """Mask of the vehicles that drive along a route."""
     log = scene.traffic_log
-    if scene.routes.length.shape[0] == 0 or scene.routes.position.shape[1] < 2:
+    if not corridor.has_routes(scene.routes):
         return jnp.zeros_like(log.has_route)
     return log.has_route & (log.kind == VEHICLE)
 
@@ -117,7 +117,7 @@ def init(scene: Scene, row: Int[Array, ""]) -> IdmState:
     position, yaw, zero = read(log.position), read(log.yaw), jnp.zeros(count, jnp.float32)
     speed = jnp.where(drives, safe_norm(read(log.velocity)), 0.0)
     arc, shift, offset, turn = zero, zero, jnp.zeros((count, 2), jnp.float32), zero
-    if scene.routes.position.shape[0] and scene.routes.position.shape[1] > 1:
+    if corridor.has_routes(scene.routes):
         arc = corridor.project_points(scene.routes, log.route, position, yaw)
         place, ahead = corridor.place_on_route(scene.routes, log.route, arc, log.size[:, 0])
         offset, turn, side = position - place, wrap_angle(yaw - ahead), heading_vector(ahead + jnp.pi / 2)
@@ -178,7 +178,7 @@ def enter(scene: Scene, state: IdmState, cars: Boxes, row: Float[Array, ""], con
 def advance(scene: Scene, state: IdmState, cars: Boxes, time_s: Float[Array, ""], config: IdmConfig, *, at_end: str, dt: float) -> IdmState:
     """Moves the vehicles by one control step."""
     log, routes = scene.traffic_log, scene.routes
-    if log.kind.shape[0] == 0 or routes.position.shape[0] == 0 or routes.position.shape[1] < 2:
+    if log.kind.shape[0] == 0 or not corridor.has_routes(routes):
         return state
     drives = find_drivers(scene) & (state.phase == ON_ROAD)
     present = jnp.where(log.kind == VEHICLE, state.phase == ON_ROAD, scene.traffic.present)
