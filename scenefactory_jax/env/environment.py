@@ -305,6 +305,7 @@ def _init_state(parts: EnvParts, key: PRNGKeyArray, scene: Scene, step: Int[Arra
 
 def _control_step(parts: EnvParts, scene: Scene, state: State, action: Float[Array, "A 3"]) -> tuple[State, StepResult]:
     """Advances a world by one control step, without the observation."""
+    logged = scene.agents  # of which samplers read the starts
     scene = _scene_at(parts, scene, replace(state, weather=rain.advance_rain(state.weather, dt=parts.control_dt)))
     action = jnp.where(state.active[:, None], _hold_action(parts, state, action), 0.0)
     after = _advance(parts, scene, state, action)
@@ -319,7 +320,7 @@ def _control_step(parts: EnvParts, scene: Scene, state: State, action: Float[Arr
         world_done = truncated | ~jnp.any(after.active)
     else:
         world_done = truncated
-        after = _respawn(parts, scene, after, clear_m=parts.respawn_clearance_m)
+        after = _respawn(parts, replace(scene, agents=logged), after, clear_m=parts.respawn_clearance_m)
     return to_strong_type(after), StepResult(None, reward, terms, events, terminated, truncated, world_done, metrics)
 
 
@@ -365,7 +366,11 @@ def _restore_non_finite(metrics: StepMetrics, before: State, after: State) -> tu
 
 
 def _respawn(parts: EnvParts, scene: Scene, state: State, *, clear_m: float) -> State:
-    """Starts finished agents again at a new sample where there is room; the others stay inactive."""
+    """Starts finished agents again at a new sample where there is room; the others stay inactive.
+
+    Args:
+        scene: at the time of the state, but with the logged agents, which samplers read.
+    """
     sample_key, key, body_key = jax.random.split(state.key, 3)
     new = spawning.admit_cars(parts.sample_agents(sample_key, scene))
     body = parts.dynamics.init(body_key, replace(scene, agents=new))

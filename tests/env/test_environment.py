@@ -600,6 +600,17 @@ def test_numbers_that_cannot_work_are_refused_by_name(override, message):
         environment.make_env(scenefactory_jax.load_config("task", "spawning=random_pairs", "dynamics=bicycle", override))
 
 
+def test_respawn_samples_from_logged_agents(config):
+    def draw(key, scene):  # each episode's starts lie 1 m beside those of the scene that the sampler sees
+        return replace(scene.agents, position=scene.agents.position + jnp.float32([0.0, 1.0]))
+
+    scene = scene_of([[0, 0], [40, 0]], [[6, 1], [60, 1]], speeds=[6.0, 0.0])
+    env = build_env(config, respawn=10.0, draw=draw)
+    state, history = drive(env, scene, jnp.zeros((2, 3)), 40)
+    assert sum(bool(h.events.goal_reached[0]) for h in history) >= 2
+    np.testing.assert_allclose(state.agents.position[0], [0.0, 1.0], atol=1e-6, err_msg="not 1 m farther with each start")
+
+
 def test_respawn_starts_finished_cars_again(config):
     env = build_env(config, respawn=10.0)
     scene = scene_of([[0, 0], [40, 0]], [[6, 0], [60, 0]], speeds=[6.0, 0.0])
