@@ -451,8 +451,8 @@ def steps_of(config):
 
 
 TIMED = {"vmax": "vmax", "plants": "vmax", "scenarionet": "scenarionet", "curriculum": "scenarionet"}  # study -> its protocol
-TIMED |= {"learners": "route100", "drive_rewards": "route100", "drive_crossings": "route100", "vmax_scenes": "vmax"}
-MANY = ("curriculum", "plants", "drive_rewards", "drive_crossings")  # environments
+TIMED |= {"learners": "route100", "drive_rewards": "route100", "drive_collisions": "route100", "vmax_scenes": "vmax"}
+MANY = ("curriculum", "plants", "drive_rewards", "drive_collisions")  # environments
 STREAMED = "recipe_drive"  # trains on a mixture of banks and generated scenes
 WHOLE = [name for name in STUDIES if name not in (*TIMED, STREAMED)]
 TWINS = {"rewards_laptop", "network_laptop"}  # nearly the same variants as another study, for a CPU

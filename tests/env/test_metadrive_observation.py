@@ -1,4 +1,4 @@
-"""MetaDrive's vector: published sizes, its columns for a street made by hand, rays against brute force, invariance, empty worlds."""
+"""MetaDrive's vector: published sizes, columns for a street made by hand, rays against brute force, invariance, empty worlds; edge rays."""
 
 import functools
 
@@ -107,3 +107,23 @@ def test_worlds_without_routes_and_traffic():
     found = np.asarray(jax.vmap(program())(*worlds))
     assert found.shape == (2, 2, 161) and np.isfinite(found).all() and found.min() >= 0 and found.max() <= 1
     assert (found[:, 0, 6:18] == 1).all() and found[0, 0, 41] < 1
+
+
+def test_edge_rays_of_a_street():
+    """Edges at y = 6 and -6, seen 1 m to the left of the middle and 0.1 rad off it, and 2 m to its right."""
+    entry = {"count": 32, "range_m": 40.0, "segments": 384, "distance_scale_m": 5.0}
+    group = observations.make({"edges": {"_target_": "edge_rays", **entry}})["edges"]
+    scene = street(starts=((0.0, 1.0), (0.0, -2.0)), yaws=(0.1, 0.0))
+    state = state_of(scene)
+    see = jax.jit(lambda scene, state: group(scene, state))
+    found = np.asarray(see(scene, state))
+    angle = 2 * np.pi * np.arange(32) / 32 + np.array([[0.1], [0.0]])
+    gap = np.abs(np.where(np.sin(angle) > 0, 6.0, -6.0) - np.array([[1.0], [-2.0]]))
+    length = np.minimum(gap / np.maximum(np.abs(np.sin(angle)), 1e-9), 40.0)
+    inside = np.abs(length * np.cos(angle)) < 35  # the street ends
+    assert inside.sum() > 50
+    np.testing.assert_allclose(found[inside], (length / (5 + length))[inside], rtol=1e-4)
+    above = replace(scene, edges=replace(scene.edges, height=jnp.full(scene.edges.valid.shape, 6.0)))  # a bridge's
+    np.testing.assert_allclose(see(above, state), 40.0 / 45.0, rtol=1e-6)
+    below = replace(above, edges=replace(above.edges, height=jnp.zeros(scene.edges.valid.shape)))
+    np.testing.assert_array_equal(see(below, state), found)

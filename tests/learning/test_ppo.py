@@ -324,7 +324,7 @@ def test_mistakes_are_named():
             ppo_config(**{name: value})
 
 
-@pytest.mark.parametrize("name", ["paper", "demo", "steady", "smoke"])
+@pytest.mark.parametrize("name", ["paper", "demo", "steady", "short", "smoke"])
 def test_configs_are_valid(name):
     assert schema.read(configs.load_config("train", f"ppo={name}")["ppo"], PPOConfig, where="ppo").horizon > 0
 

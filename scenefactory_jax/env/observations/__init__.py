@@ -15,6 +15,7 @@ from scenefactory_jax.core.instantiate import instantiate
 from scenefactory_jax.core.types import Observation, Scene, State
 from scenefactory_jax.env.observations.column_bounds import ANY, FRACTION, LENGTH, SIGNED, bound_observation
 from scenefactory_jax.env.observations.control_sets import lights, nearest_controls, signs
+from scenefactory_jax.env.observations.edge_rays import edge_rays
 from scenefactory_jax.env.observations.lane_vector import lane
 from scenefactory_jax.env.observations.leader_vector import leader
 from scenefactory_jax.env.observations.log_view import log
@@ -33,6 +34,7 @@ from scenefactory_jax.env.observations.vmax import vmax_base, vmax_lane, vmax_ro
 __all__ = ["ANY", "FRACTION", "LENGTH", "SIGNED", "Group", "bound_observation", "make", "observe"]
 __all__ += [
     "closest_approach",
+    "edge_rays",
     "ego",
     "friction_ahead",
     "grade_ahead",
