@@ -92,7 +92,7 @@ def make_episode_runner(
         if score and driven.frames is not None:
             start = scoring.Start(driven.first.agents, driven.first.motion, driven.first_traffic, begun.log)
             values, failing = score(batch, start, driven.frames)
-            records |= {name: column[here] for name, column in values.items()}
+            records = add_scores(records, {name: column[here] for name, column in values.items()})
         rollouts = realism.read_rollouts(driven.frames) if realism and driven.frames is not None else None
         recording = None
         if worlds and repeat == 0:
@@ -110,6 +110,12 @@ def make_episode_runner(
         return Run(records | _spread_scenes(columns, records["world"]), recordings[0], files)
 
     return run
+
+
+def add_scores(records: Mapping[str, np.ndarray], scores: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """Adds columns of scores. They take the place of columns of the same name, but for agents that ended before the first scored state."""
+    kept = {name: np.where(np.isnan(column), records.get(name, np.nan), column) for name, column in scores.items()}
+    return {**records, **kept}
 
 
 def _spread_scenes(columns: Mapping[str, np.ndarray], world: np.ndarray) -> dict[str, np.ndarray]:

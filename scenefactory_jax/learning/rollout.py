@@ -5,7 +5,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
+from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray, Shaped
 
 from scenefactory_jax.core import sharding
 from scenefactory_jax.core.pytree import pytree_dataclass, tree_where
@@ -45,7 +45,7 @@ class Worlds:
 class Sample:
     """One action of every slot, and its results until the next action."""
 
-    observation: Observation
+    observation: Observation  # of every slot, or with axes G, K of the slots in `kept`
     action: Float[Array, "W A 3"]  # before the environment's clipping
     mean: Float[Array, "W A 3"]
     log_probability: Float[Array, "W A"]
@@ -55,6 +55,7 @@ class Sample:
     terminated: Bool[Array, "W A"]  # by an event
     truncated: Bool[Array, "W A"]  # active when the world reached the time limit
     position: Float[Array, "W A 2"]  # before the action
+    kept: Int[Array, "G K"] | None = None  # slots of each group of worlds whose observations there are, W / G * A: none; None: all
 
 
 @pytree_dataclass
@@ -98,6 +99,8 @@ def collect_rollout(
     *,
     horizon: int,
     storage: Storage = "float32",
+    kept: int | None = None,
+    groups: int = 1,
     axis: str | None = None,
 ) -> tuple[Worlds, Sample, Counts, SceneStats]:
     """Acts `horizon` times in `W` worlds; a world that is done restarts with a new key before it is observed.
@@ -107,6 +110,8 @@ def collect_rollout(
 
     Args:
         storage: type of the observations in samples, as which the policy sees them.
+        kept: observations that samples hold of each action and group, of agents that are active and not truncated; None: all.
+        groups: of this device's worlds.
         axis: mesh axis of the devices that share the worlds, see `sharding`.
     """
 
@@ -118,8 +123,11 @@ def collect_rollout(
         mean, log_std, value = policy.apply(parameters, replay_buffer.expand(observation))
         action = mean + jnp.exp(log_std) * sample_noise(action_key, mean, axis)
         worlds, outcome, counts = step_worlds(env, scenes, worlds, action, start_key, axis=axis)
-        density = log_probability(action, mean, log_std)
-        return worlds, (Sample(observation, action, mean, density, value, **vars(outcome), position=position), counts)
+        density, slots = log_probability(action, mean, log_std), None
+        if kept is not None:
+            slots = choose_slots(jax.random.fold_in(key, 2), outcome.active & ~outcome.truncated, groups=groups, count=kept, axis=axis)
+            observation = jax.tree.map(lambda leaf: take_slots(leaf, slots), observation)
+        return worlds, (Sample(observation, action, mean, density, value, **vars(outcome), position=position, kept=slots), counts)
 
     worlds, (samples, counts) = jax.lax.scan(step, worlds, jax.random.split(key, horizon))
     return worlds, samples, jax.tree.map(jnp.sum, counts), count_episodes(counts)
@@ -166,6 +174,31 @@ def step_worlds(
     fresh = jax.vmap(env.init_state)(sharding.world_keys(key, len(result.world_done), axis), scenes)
     state = tree_where(result.world_done, fresh, after)
     return Worlds(state, jax.vmap(env.observe)(scenes, state), stats), outcome, counts
+
+
+def choose_slots(
+    key: PRNGKeyArray, mask: Bool[Array, "W A"], *, groups: int, count: int, axis: str | None
+) -> Int[Array, "{groups} {count}"]:
+    """Chooses `count` slots of a mask in each group of worlds, from a random one on in order; a group's number of slots where it has fewer.
+
+    Args:
+        axis: mesh axis of the devices that share the groups.
+    """
+
+    def choose(key: PRNGKeyArray, mask: Bool[Array, " P"]) -> Int[Array, " K"]:
+        slots = len(mask)
+        first = jax.random.randint(key, (), 0, slots)
+        turned = jnp.roll(mask, -first)
+        place = jnp.where(turned, jnp.cumsum(turned) - 1, count)
+        return jnp.full(count, slots).at[place].set((first + jnp.arange(slots)) % slots, mode="drop")
+
+    return jax.vmap(choose)(sharding.world_keys(key, groups, axis), mask.reshape(groups, -1))
+
+
+def take_slots(x: Shaped[Array, "W A *rest"], slots: Int[Array, "G K"]) -> Shaped[Array, "G K *rest"]:
+    """Takes slots of each group of worlds; zeros for none."""
+    grouped = x.reshape(len(slots), -1, *x.shape[2:])
+    return jax.vmap(lambda x, slots: x.at[slots].get(mode="fill", fill_value=0))(grouped, slots)
 
 
 def sample_noise(key: PRNGKeyArray, like: Float[Array, "rows ..."], axis: str | None) -> Float[Array, "rows ..."]:

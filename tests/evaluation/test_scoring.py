@@ -19,7 +19,7 @@ from scenefactory_jax.core.pytree import replace, unchecked
 from scenefactory_jax.core.schema import ConfigError
 from scenefactory_jax.core.track_interpolation import make_empty_boxes
 from scenefactory_jax.core.types import EDGE_BOUNDARY, LANE_STREET, AgentLog, Boxes, Motion
-from scenefactory_jax.evaluation import scoring
+from scenefactory_jax.evaluation import episode_records, scoring
 from scenefactory_jax.evaluation.episodes import EpisodeFrame, TrafficFrame
 from scenefactory_jax.evaluation.settings import ScoreSettings
 
@@ -194,3 +194,12 @@ def test_the_command_finds_the_official_scores_of_logs(tmp_path):
         for theirs, ours in OFFICIAL.items():
             tolerance = 0.31 if "lanes" in ours else 2e-3
             assert records[ours][row] == pytest.approx(expected[theirs], abs=tolerance), (one["scene"], ours)
+
+
+def test_agents_that_end_before_the_first_scored_state_keep_their_records():
+    """`mean_speed` and the like have a value, which means over agents need."""
+    records = {"mean_speed": np.array([3.0, 4.0]), "clean": np.array([True, False])}
+    joined = episode_records.add_scores(records, {"mean_speed": np.array([np.nan, 5.0]), "vmax_score": np.array([np.nan, 1.0])})
+    np.testing.assert_array_equal(joined["mean_speed"], [3.0, 5.0])
+    np.testing.assert_array_equal(joined["vmax_score"], [np.nan, 1.0])
+    assert joined["clean"].tolist() == [True, False]

@@ -160,7 +160,8 @@ def test_minibatches_are_disjoint_and_share_the_active_samples_evenly():
 def test_left_out_samples_are_counted_for_each_group():
     """Of 12 active samples in the first half and 2 in the second, two minibatches of 3 from each half hold 6 and 2."""
     weight = (jnp.arange(24) < 14).astype(jnp.float32)
-    assert float(minibatches.count_left_out(weight, size=12, groups=2, axis=None)) == pytest.approx(6 / 14)
+    assert float(minibatches.count_left_out(weight, weight.sum(), size=12, groups=2, axis=None)) == pytest.approx(6 / 14)
+    assert float(minibatches.count_left_out(weight, jnp.float32(28.0), size=12, groups=2, axis=None)) == pytest.approx(20 / 28)
 
 
 def test_minibatches_that_are_not_finite_are_skipped_and_counted(batch):
@@ -374,6 +375,35 @@ def test_probe_5_action_that_depends_on_the_observation(probes):
     np.testing.assert_allclose(look(-1.0, 1.0)[0], [-0.5, 0.5], atol=0.1)
     assert float(history[-1]["reward"]) > float(history[0]["reward"]) + 0.1
     assert float(history[-1]["ppo/left_out"]) == 0.0
+
+
+@pytest.mark.parametrize("kept, groups", [(5, 1), (3, 2), (1, 2)])
+def test_a_rollout_keeps_active_agents_first(course, kept, groups):
+    """Rows with weight are rows of the whole rollout, all or as many as there is room for; what finds no room is counted."""
+    policy, env, stage = late_fusion.make(**SMALL), probe(life=5, episode_steps=4), scenes(WORLDS)
+    train_state = course[0].init(jax.random.key(0), stage)
+    collect = functools.partial(rollout.collect_rollout, env, policy, train_state.parameters, stage, train_state.worlds, horizon=3)
+    part = {"kept": kept * WORLDS // groups, "groups": groups}
+    ppo = PPO(env, policy, ppo_config(normalize_advantages=False), groups=groups)
+
+    @jax.jit
+    def both(key):
+        made = [collect(key)[1], collect(key, **part)[1]]
+        batches = [train_iteration.make_batch(ppo, samples, samples.reward, samples.value) for samples in made]
+        total = train_iteration.find_weight(made[1]).sum()
+        left_out = minibatches.count_left_out(batches[1].weight, total, size=len(batches[1].weight), groups=groups, axis=None)
+        return *batches, left_out
+
+    whole, fewer, left_out = jax.device_get(both(jax.random.key(1)))
+    number = np.minimum(whole.weight.reshape(3 * groups, -1).sum(1), part["kept"]).sum()
+    assert fewer.weight.sum() == number > 0 and len(fewer.weight) == 3 * groups * part["kept"]
+    assert left_out == pytest.approx(1 - number / whole.weight.sum()) and (left_out > 0) == (kept == 1)
+
+    def list_rows(batch):
+        weighted = [leaf[batch.weight > 0].reshape(int(batch.weight.sum()), -1) for leaf in jax.tree.leaves(batch)]
+        return {tuple(row) for row in np.concatenate(weighted, axis=1)}
+
+    assert len(list_rows(whole)) == whole.weight.sum() and len(list_rows(fewer)) == number and list_rows(fewer) <= list_rows(whole)
 
 
 def test_a_rollout_in_float16_holds_what_the_policy_saw(course):

@@ -62,7 +62,7 @@ def train_iteration(imitation: Imitation, train_state: TrainState, scenes: Scene
     """Computes one iteration: rollout, expert, discriminator, rewards, PPO."""
     ppo, name, config = imitation.ppo, imitation.name, imitation.config
     rollout_key, expert_key, judge_key, update_key, key = jax.random.split(train_state.key, 5)
-    collected = ppo_iteration.collect(ppo, train_state, scenes, rollout_key)
+    collected = ppo_iteration.collect(ppo, train_state, scenes, rollout_key, keep_all=True)
     buffer = train_state.buffer[name]
     if imitation.expert is not None:
         drive = functools.partial(drive_expert, imitation, scenes, expert_key)
@@ -123,7 +123,7 @@ def make_policy_pairs(imitation: Imitation, parameters: Any, collected: Collecte
     after: Observation = jax.tree.map(lambda seen, last: jnp.concatenate([seen[1:], last[None]]), samples.observation, worlds.observation)
     _, log_std, _ = imitation.ppo.policy.apply(parameters, worlds.observation)
     density = find_density(imitation, samples.action, samples.mean, log_std)
-    weight = (samples.active & ~samples.truncated).astype(jnp.float32)
+    weight = ppo_iteration.find_weight(samples)
     seen, after = (replay_buffer.compress(group, imitation.config.storage) for group in (samples.observation, after))
     return Pairs(seen, after, ~samples.terminated, density, weight)
 

@@ -29,7 +29,7 @@ from scenefactory_jax.learning.off_policy import Learnt
 from scenefactory_jax.learning.ppo import gae, loss
 from scenefactory_jax.learning.ppo import train_iteration as ppo_iteration
 from scenefactory_jax.learning.ppo.config import PPOConfig
-from scenefactory_jax.learning.ppo.minibatches import flatten, minibatch_size, split_minibatches
+from scenefactory_jax.learning.ppo.minibatches import flatten_kept, minibatch_size, split_minibatches
 from scenefactory_jax.learning.ppo.train_iteration import PPO
 from scenefactory_jax.learning.trainer import Metrics, Trainer, TrainState
 
@@ -64,7 +64,7 @@ def train_iteration(copo: CoPO, train_state: TrainState, scenes: Scene) -> tuple
     batch = ppo_iteration.make_batch(ppo, samples, mixed, returns)
     train_state, metrics = ppo_iteration.learn_batch(ppo, replace(train_state, key=key), collected, batch, log_std, update_key)
 
-    advantage = flatten(advantage, groups=ppo.groups)
+    advantage = flatten_kept(advantage, samples.kept, groups=ppo.groups)
     size = minibatch_size(ppo.config, collected.worlds.state.active.shape, groups=ppo.groups)
     learnt, more = update_distribution(copo, learnt, before, train_state.parameters, batch, advantage, learn_key, size=size)
     explained = jax.vmap(functools.partial(loss.explained_variance, axis=axis), in_axes=(-1, -1, None))

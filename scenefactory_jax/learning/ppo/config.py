@@ -14,7 +14,7 @@ class PPOConfig:
     horizon: Count  # actions of a rollout, of `actions.action_repeat` control steps each
     epochs: Count  # passes over a rollout
     minibatches: Count  # gradient steps of a pass
-    sample_fraction: Annotated[float, Bounds(above=0, max=1)]  # of a rollout's samples in a pass, active agents first
+    sample_fraction: Annotated[float, Bounds(above=0, max=1)]  # of an action's samples that are kept, active agents first
     storage: Storage  # type of a rollout's observations
     shards: int | None  # groups of worlds whose samples are shuffled separately; None: one a device
     permutation: Literal["once", "each_epoch"]  # of samples to minibatches: once a rollout (RSL-RL) or in each pass

@@ -7,6 +7,7 @@ from jaxtyping import Array, Float, Int, PRNGKeyArray
 from scenefactory_jax.core import sharding
 from scenefactory_jax.core.schema import ConfigError
 from scenefactory_jax.learning.ppo.config import PPOConfig
+from scenefactory_jax.learning.rollout import take_slots
 
 
 def minibatch_size(config: PPOConfig, shape: tuple[int, ...], *, groups: int = 1) -> int:
@@ -23,7 +24,7 @@ def minibatch_size(config: PPOConfig, shape: tuple[int, ...], *, groups: int = 1
     samples = config.horizon * worlds * agents
     if worlds % groups:
         raise ConfigError(f"worlds: expected a multiple of {groups} shards, got {worlds}")
-    size = int(samples // groups * config.sample_fraction) // config.minibatches * groups
+    size = config.horizon * count_kept(config, shape, groups=groups) // config.minibatches * groups
     if size < 1 or (config.sample_fraction == 1.0 and samples % (config.minibatches * groups)):
         product = f"horizon {config.horizon} x {worlds} worlds x {agents} agents = {samples} samples"
         parts = f"{config.minibatches} minibatches" + (f" of {groups} shards" if groups > 1 else "")
@@ -31,10 +32,21 @@ def minibatch_size(config: PPOConfig, shape: tuple[int, ...], *, groups: int = 1
     return size
 
 
+def count_kept(config: PPOConfig, shape: tuple[int, ...], *, groups: int) -> int:
+    """Computes how many samples of an action each group of worlds keeps; arguments as of `minibatch_size`."""
+    worlds, agents = shape
+    return int(worlds // groups * agents * config.sample_fraction)
+
+
 def flatten(x: Array, *, groups: int) -> Array:
     """Flattens [T, W, A, ...] to [T * W * A, ...], one group of worlds after the other."""
     time, worlds, *rest = x.shape
     return x.reshape(time, groups, worlds // groups, *rest).swapaxes(0, 1).reshape(-1, *rest[1:])
+
+
+def flatten_kept(x: Array, kept: Int[Array, "T G K"] | None, *, groups: int) -> Array:
+    """Flattens [T, W, A, ...] to [T * G * K, ...], the slots that a rollout kept, or all; one group of worlds after the other."""
+    return flatten(x if kept is None else jax.vmap(take_slots)(x, kept), groups=groups)
 
 
 def split_minibatches(
@@ -59,8 +71,14 @@ def split_minibatches(
     return index.swapaxes(0, 1).reshape(minibatches, size)
 
 
-def count_left_out(weight: Float[Array, " N"], *, size: int, groups: int, axis: str | None) -> Float[Array, ""]:
-    """Computes the fraction of the samples with weight that minibatches with `size` samples in all leave out."""
+def count_left_out(
+    weight: Float[Array, " N"], total: Float[Array, ""], *, size: int, groups: int, axis: str | None
+) -> Float[Array, ""]:
+    """Computes the fraction of the samples with weight that minibatches with `size` samples in all leave out.
+
+    Args:
+        total: weight of all samples of this device, also of those that the rollout did not keep.
+    """
     active = weight.reshape(groups, -1).sum(axis=1)
-    total, used = sharding.sum_over_devices((active.sum(), jnp.minimum(active, size // groups).sum()), axis)
+    total, used = sharding.sum_over_devices((total, jnp.minimum(active, size // groups).sum()), axis)
     return (total - used) / jnp.maximum(total, 1.0)

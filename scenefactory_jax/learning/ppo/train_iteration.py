@@ -24,7 +24,14 @@ from scenefactory_jax.env import environment
 from scenefactory_jax.learning import rollout, trainer
 from scenefactory_jax.learning.ppo import gae, loss
 from scenefactory_jax.learning.ppo.config import PPOConfig
-from scenefactory_jax.learning.ppo.minibatches import count_left_out, flatten, minibatch_size, split_minibatches
+from scenefactory_jax.learning.ppo.minibatches import (
+    count_kept,
+    count_left_out,
+    flatten,
+    flatten_kept,
+    minibatch_size,
+    split_minibatches,
+)
 from scenefactory_jax.learning.trainer import Metrics, Trainer, TrainState
 
 
@@ -61,9 +68,11 @@ def train_iteration(ppo: PPO, train_state: TrainState, scenes: Scene) -> tuple[T
     return learn(ppo, replace(train_state, key=key), collected, update_key)
 
 
-def collect(ppo: PPO, train_state: TrainState, scenes: Scene, key: PRNGKeyArray) -> Collected:
-    """Acts in all worlds."""
-    numbers = {"horizon": ppo.config.horizon, "storage": ppo.config.storage, "axis": ppo.axis}
+def collect(ppo: PPO, train_state: TrainState, scenes: Scene, key: PRNGKeyArray, *, keep_all: bool = False) -> Collected:
+    """Acts in all worlds; of the observations a `sample_fraction` is kept, or all."""
+    numbers = {"horizon": ppo.config.horizon, "storage": ppo.config.storage, "groups": ppo.groups, "axis": ppo.axis}
+    if ppo.config.sample_fraction < 1.0 and not keep_all:
+        numbers["kept"] = count_kept(ppo.config, train_state.worlds.state.active.shape, groups=ppo.groups)
     parts = rollout.collect_rollout(ppo.env, ppo.policy, train_state.parameters, scenes, train_state.worlds, key, **numbers)
     return Collected(*parts)
 
@@ -80,11 +89,16 @@ def learn(ppo: PPO, train_state: TrainState, collected: Collected, key: PRNGKeyA
 def learn_batch(
     ppo: PPO, train_state: TrainState, collected: Collected, batch: loss.Batch, log_std: Float[Array, " 3"], key: PRNGKeyArray
 ) -> tuple[TrainState, Metrics]:
-    """Learns from a rollout whose advantages are known: epochs of minibatches, metrics; `log_std`: of the policy that acted."""
+    """Learns from a rollout whose advantages are known: epochs of minibatches, metrics; `log_std`: of the policy that acted.
+
+    The metric `left_out`: fraction of the samples with weight that no minibatch holds.
+    """
     config, axis = ppo.config, ppo.axis
     worlds, _, counts, scene_stats = collected
     size = minibatch_size(config, worlds.state.active.shape, groups=ppo.groups)
     parameters, optimizer, metrics = update_epochs(ppo, train_state, batch, log_std, key, size=size)
+    total = jnp.sum(find_weight(collected.samples))
+    metrics["left_out"] = count_left_out(batch.weight, total, size=size * config.minibatches, groups=ppo.groups, axis=axis)
     counts = sharding.sum_over_devices(counts, axis)
     train_state = replace(
         train_state,
@@ -116,16 +130,19 @@ def compute_batch(ppo: PPO, samples: rollout.Sample, last_value: Float[Array, "W
 
 
 def make_batch(ppo: PPO, samples: rollout.Sample, advantage: Float[Array, "T W A"], returns: Float[Array, "T W A *values"]) -> loss.Batch:
-    """Makes a flat batch of samples [T, W, A] with their advantages; groups of worlds follow one another.
-
-    Samples of inactive agents and of agents that the time limit stopped carry no weight.
-    """
-    weight = (samples.active & ~samples.truncated).astype(jnp.float32)
-    columns = samples.observation, samples.action, samples.mean, samples.log_probability, samples.value, advantage, returns, weight
-    batch = loss.Batch(*jax.tree.map(functools.partial(flatten, groups=ppo.groups), columns))
+    """Makes a flat batch of the samples [T, W, A] that were kept, with their advantages; groups of worlds follow one another."""
+    columns = samples.action, samples.mean, samples.log_probability, samples.value, advantage, returns, find_weight(samples)
+    observation = jax.tree.map(functools.partial(flatten, groups=ppo.groups), samples.observation)
+    kept = functools.partial(flatten_kept, kept=samples.kept, groups=ppo.groups)
+    batch = loss.Batch(observation, *jax.tree.map(kept, columns))
     if not ppo.config.normalize_advantages:
         return batch
     return replace(batch, advantage=loss.normalize_advantages(batch.advantage, batch.weight, axis=ppo.axis))
+
+
+def find_weight(samples: rollout.Sample) -> Float[Array, "T W A"]:
+    """Samples of inactive agents and of agents that the time limit stopped carry no weight, all others the weight 1."""
+    return (samples.active & ~samples.truncated).astype(jnp.float32)
 
 
 def update_epochs(
@@ -134,7 +151,7 @@ def update_epochs(
     """Passes over the batch `epochs` times, in minibatches of `size` samples.
 
     The metrics are means of the loss's metrics over the minibatches that changed the parameters; `skipped`: minibatches whose loss or
-    gradient was not finite; `left_out`: fraction of the samples with weight that no minibatch holds.
+    gradient was not finite.
     """
     config = ppo.config
     update = functools.partial(update_minibatch, ppo, batch, log_std_old, max_learning_rate(config, train_state.iteration))
@@ -152,7 +169,6 @@ def update_epochs(
     metrics |= {
         "skipped": jnp.sum(skipped, dtype=jnp.float32),
         "learning_rate": _hyperparams(optimizer)["learning_rate"],
-        "left_out": count_left_out(batch.weight, size=size * config.minibatches, **groups),
     }
     return parameters, optimizer, metrics
 
