@@ -26,6 +26,7 @@ from scenefactory_jax.evaluation.records import Records, select_rows
 
 HERE = Path(__file__).parent
 TOWNS = ("scenes.heldout.path=null", "scenes.heldout.seed=2000000", "scenes.heldout.count=64")  # as in experiments/suites
+BEYOND = ("observations.route.beyond_goal=true", "+observations.ego.beyond_goal=true")  # these episodes go on behind the goal
 AMONG = ("traffic=log_playback", "scenes.pack.traffic=64")
 PLANNERS = ("log", "pure_pursuit", "route_pursuit", "idm_route", "pdm_closed")
 RECORDED = "log"  # has no way on drawn routes, and no log to follow among traffic that reacts
@@ -47,7 +48,7 @@ class Row(NamedTuple):
     overrides: tuple[str, ...]
     numbers: tuple[Number, ...]
     has_log: bool = True
-    scored: bool = False
+    of_runs: tuple[str, ...] = ()  # further overrides of runs; those of planners are in `conf/protocol`
 
 
 def count_events(records: Records) -> dict[str, np.ndarray]:
@@ -83,12 +84,12 @@ ROWS = {
     **{f"grip_{mu:g}": _make_grip(mu, aim) for mu, aim in ((1.0, ">= 90 %"), (0.6, ">= 90 %"), (0.3, ">= 80 %"), (0.15, ">= 60 %"))},
     "conflict": Row(("protocol=conflict",), (), (
         Number("`conflict`: at-fault collisions", "at_fault_collision", "<= 1.5 %"), Number("`conflict`: collisions", "collision_rate", ""),
-    ), scored=True),
+    )),
     "conflict_reactive": Row(("protocol=conflict_reactive",), (), (
         Number("`conflict_reactive`: at-fault collisions", "at_fault_collision", "<= 1 %"),
-    ), has_log=False, scored=True),
-    "vmax": Row(("protocol=vmax",), (), (Number("V-Max score", "vmax_score", ">= 0.90"),), scored=True),
-    "nuplan": Row(("protocol=nuplan",), (), (Number("nuPlan score", "nuplan_score", ">= 0.90"),), scored=True),
+    ), has_log=False),
+    "vmax": Row(("protocol=vmax",), (), (Number("V-Max score", "vmax_score", ">= 0.90"),), of_runs=BEYOND),
+    "nuplan": Row(("protocol=nuplan",), (), (Number("nuPlan score", "nuplan_score", ">= 0.90"),), of_runs=BEYOND),
     "recorded_routes": Row(("protocol=recorded_routes",), (), (Number("red lights run", "red_light_rate", "<= 0.5 %"),)),
 }  # fmt: skip
 
@@ -96,7 +97,8 @@ ROWS = {
 def measure(row: Row, runs: tuple[str, ...], planner: str | None, scenes: str, given: argparse.Namespace) -> dict[str, Any]:
     """Measures the numbers of a row: label -> estimate; a number that nothing has is left out."""
     towns = TOWNS if scenes == "null" else ()
-    asked = Asked(runs, planner, row.protocol, (*row.overrides, *towns, *given.overrides), None if scenes == "null" else scenes)
+    overrides = (*row.overrides, *(() if planner else row.of_runs), *towns, *given.overrides)
+    asked = Asked(runs, planner, row.protocol, overrides, None if scenes == "null" else scenes)
     found, numbers = evaluations.evaluate(asked, given.kept), {}
     for number in row.numbers:
         chosen = {seed: number.select(records) for seed, records in found.items()}

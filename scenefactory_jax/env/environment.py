@@ -35,6 +35,7 @@ from scenefactory_jax.core.types import (
 )
 from scenefactory_jax.dynamics.collision import collect_boxes
 from scenefactory_jax.env import history, observations, rewards, route_following, spawning, step_metrics, termination, traffic
+from scenefactory_jax.env.actions import Rates, move
 from scenefactory_jax.env.history import HistorySpec
 from scenefactory_jax.roadgraph import elevation
 from scenefactory_jax.weather import friction, rain, road_condition
@@ -62,6 +63,11 @@ class Actions:
     command: dict[str, Any]  # an entry of `env.actions`
     action_repeat: Count  # control steps per action
     numbers: Literal[2, 3] = 3  # of an action that `command` reads, from the first on
+    rates: Rates | None = None  # the numbers of an action move those that `command` reads; None: they are these
+
+    def bind_rates(self, action_s: float) -> Callable[..., Float[Array, "A 3"]] | None:
+        """Binds `EnvParts.move_action`; `action_s`: between two actions."""
+        return self.rates and functools.partial(move, rates=self.rates, action_s=action_s)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -121,6 +127,7 @@ class EnvParts(NamedTuple):
     respawn_clearance_m: float | None  # see `Spawning`
     hides_weather: bool = False  # from the observations: `weather.hidden`
     history: HistorySpec | None = None  # rows of `State.history`; None: nothing reads it
+    move_action: Callable[..., Float[Array, "A 3"]] | None = None  # (action, throttle, steer, brake before) -> what `map_action` reads
 
 
 def make_env(config: Mapping[str, Any]) -> Env:
@@ -162,6 +169,7 @@ def make_parts(config: Mapping[str, Any]) -> EnvParts:
         respawn_clearance_m=read.spawning.respawn_clearance_m,
         hides_weather=read.weather.get("hidden", False),
         history=history.make_spec(readers, control_dt=context["control_dt"]),
+        move_action=read.actions.bind_rates(read.actions.action_repeat / read.timing.control_hz),
     )
 
 
@@ -331,7 +339,9 @@ def _observe(parts: EnvParts, scene: Scene, state: State) -> Observation:
 
 def _hold_action(parts: EnvParts, state: State, action: Float[Array, "A 3"]) -> Float[Array, "A 3"]:
     """Computes throttle, steer and brake of this control step: of the new action if one is read, else of the previous one."""
-    new = jnp.clip(parts.map_action(jnp.clip(action, -1.0, 1.0)), -1.0, 1.0)
+    action = jnp.clip(action, -1.0, 1.0)
+    action = action if parts.move_action is None else parts.move_action(action, state.previous_action)
+    new = jnp.clip(parts.map_action(action), -1.0, 1.0)
     return new if parts.action_repeat == 1 else jnp.where(state.step % parts.action_repeat == 0, new, state.previous_action)
 
 

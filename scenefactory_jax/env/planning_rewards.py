@@ -103,3 +103,9 @@ def comfort(step: RewardInput, *, start_row: Annotated[int, Bounds(min=0)]) -> F
     velocity = jnp.take_along_axis(velocity, age[..., None], axis=1)[:, ::-1]
     yaw = jnp.take_along_axis(yaw, age, axis=1)[:, ::-1]
     return planning_metrics.compute_comfort(planning_metrics.compute_comfort_parts(velocity, yaw, dt=SPACING_S))
+
+
+@need_history(planning_metrics.COMFORT_ROWS - 1)
+def discomfort(step: RewardInput, *, start_row: Annotated[int, Bounds(min=0)]) -> Float[Array, " A"]:
+    """1 less `comfort`: with a negative weight a price, where comfort's own value would pay for each step of a longer drive."""
+    return 1.0 - comfort(step, start_row=start_row)

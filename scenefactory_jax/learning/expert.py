@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
 from scenefactory_jax.core.instantiate import instantiate
-from scenefactory_jax.core.schema import Fraction, NonNegative, Positive
+from scenefactory_jax.core.schema import ConfigError, Fraction, NonNegative, Positive
 from scenefactory_jax.core.types import Scene, State
 from scenefactory_jax.env import environment
 from scenefactory_jax.env.observations.log_view import LogView
@@ -39,8 +39,10 @@ def make_expert(config: Mapping[str, Any]) -> Act | None:
     actions, or the run's groups if it has none. Its action is one to learn from where the agent is within its log, if it follows one.
 
     Raises:
-        ConfigError: a planner that does not fit.
+        ConfigError: a planner that does not fit; actions that are rates, where what is imitated are pedals.
     """
+    if rates := config["actions"].get("rates"):
+        raise ConfigError(f"actions.rates: expected null for a learner that imitates, whose expert acts by pedals, got {rates}")
     if config["learner"]["samples"] is not None:
         return None
     entry = set_action_time(config["learner"]["expert"], config)

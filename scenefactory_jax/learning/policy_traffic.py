@@ -177,4 +177,5 @@ def make_parts(drivers: Drivers, dynamics: Dynamics, *, ending: list[EventName],
         control_dt=control_dt,
         respawn_clearance_m=None,  # `advance` starts vehicles
         history=spec,
+        move_action=actions.bind_rates(period),
     )

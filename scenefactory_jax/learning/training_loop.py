@@ -154,7 +154,12 @@ def make_policy(config: Mapping[str, Any]) -> Policy:
 
     Planners are given the run's `dynamics`, encoders its `observations`, and networks the kind of actor and the number of values
     that its `learner` trains, and how many numbers of an action its `actions` read.
+
+    Raises:
+        ConfigError: an entry that does not fit; a planner, which acts by pedals, where actions are rates.
     """
+    if "evaluation.planners" in str(config["policy"].get("_target_")) and (rates := config.get("actions", {}).get("rates")):
+        raise ConfigError(f"actions.rates: expected null for a planner, which acts by pedals, got {rates}; valid: actions=one_pedal_10hz")
     names = {"dynamics": "dynamics", "observations": "observation_groups"}  # planners have numbers that are called observations
     context = {names[key]: config[key] for key in names if key in config}
     learner, actions = config.get("learner", {}), config.get("actions", {})

@@ -20,6 +20,7 @@ from scenefactory_jax.env.observations.column_bounds import compress_length
 from scenefactory_jax.evaluation import episodes
 from scenefactory_jax.evaluation.failure_signals import SignalThresholds
 from scenefactory_jax.evaluation.route_signals import CourseThresholds
+from scenefactory_jax.learning import expert, training_loop
 from scenefactory_jax.roadgraph import queries
 
 pytestmark = pytest.mark.usefixtures("quickly")
@@ -598,6 +599,28 @@ def test_mistakes_in_a_mixture_are_named(change, message):
 def test_numbers_that_cannot_work_are_refused_by_name(override, message):
     with pytest.raises(ConfigError, match=message):
         environment.make_env(scenefactory_jax.load_config("task", "spawning=random_pairs", "dynamics=bicycle", override))
+
+
+def test_rates_move_pedals_and_steering(config):
+    """Twice 0.1 s at 2/s up, then full rate down past zero, to a brake, and against the end."""
+    rates = actions.Rates(up_per_s=2.0, down_per_s=4.0, steer_per_s=1.5)
+    env = build_env(config, hold=3, move=functools.partial(actions.move, rates=rates, action_s=0.1))
+    scene = scene_of([[0, 0], [40, 0]], [[60, 0], [60, 0]], speeds=[1.0, 0.0])
+    state, _ = env.reset(jax.random.key(0), scene)
+    applied = []
+    for pedal, steer in ((1.0, 1.0), (1.0, -0.5), (-1.0, 0.0), (-0.5, 3.0)):
+        state, _ = jitted(env.step)(scene, state, jnp.tile(jnp.array([pedal, steer, 0.7]), (2, 1)))
+        applied.append(np.asarray(state.previous_action[0]))
+    # pedals_with_reverse keeps the sign of the throttle, and the third number is its brake
+    np.testing.assert_allclose(applied, [[0.2, 0.15, 0.7], [-0.3, 0.075, 0.7], [-1.0, 0.075, 0.7], [-1.0, 0.225, 0.7]], atol=1e-6)
+
+
+def test_planners_and_imitation_refuse_rates():
+    load = functools.partial(scenefactory_jax.load_config, "train", "actions=rates_10hz")
+    with pytest.raises(ConfigError, match=r"actions\.rates: expected null for a planner, .*valid: actions=one_pedal_10hz"):
+        training_loop.make_policy(load("policy=pure_pursuit"))
+    with pytest.raises(ConfigError, match=r"actions\.rates: expected null for a learner that imitates"):
+        expert.make_expert(load("learner=bc"))
 
 
 def test_respawn_samples_from_logged_agents(config):

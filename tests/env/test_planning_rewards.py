@@ -96,6 +96,8 @@ def test_speed_gap_and_comfort_of_the_behaviour_reward():
     assert terms("vmax_behaviour", other=(11.4, 2.1))["ttc"] == 0  # beside the way
     jolt = lambda past: replace(past, velocity=past.velocity.at[0].add(1.0))  # noqa: E731
     assert 0.1 < terms("vmax_behaviour", history=jolt)["comfort"] < 0.49
+    fall = 1 - terms("vmax_behaviour", history=jolt)["comfort"] / 0.5
+    assert terms("drive_gentle", history=jolt)["discomfort"] == pytest.approx(-0.2 * fall, rel=1e-5)
     unknown = lambda past: replace(jolt(past), valid=jnp.zeros_like(past.valid))  # noqa: E731
     assert terms("vmax_behaviour", history=unknown)["comfort"] == pytest.approx(0.5, abs=1e-6)
 

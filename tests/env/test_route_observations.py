@@ -16,7 +16,9 @@ GO, CAUTION, STOP = (LIGHT_STATES.index(name) for name in ("go", "caution", "sto
 CORNER, LENGTH, DT = 60, 100, 1 / 30
 ENTRIES = load_config("train", "observations=drive")["observations"]
 NEAREST = {"_target_": "nearest_controls", "count": 3, "radius_m": 50.0, "distance_scale_m": 20.0}
-GROUPS = observations.make({name: ENTRIES[name] for name in ("route", "lights", "signs")} | {"nearest": NEAREST}, control_dt=DT)
+BEYOND = {name: {**ENTRIES[kind], "beyond_goal": True} for name, kind in {"far_route": "route", "far_goal": "ego"}.items()}
+NAMED = {name: ENTRIES[name] for name in ("route", "lights", "signs", "ego")}
+GROUPS = observations.make(NAMED | BEYOND | {"nearest": NEAREST}, control_dt=DT)
 AHEAD = ENTRIES["route"]["ahead_m"]
 
 
@@ -93,6 +95,15 @@ def test_the_route_is_seen_from_the_car():
     np.testing.assert_allclose(points[row], [11 / 50, -50 / 50, 1.0, 0.0, 0.0], atol=1e-5)
     np.testing.assert_allclose(points[AHEAD.index(90.0)], points[AHEAD.index(80.0)])  # the goal lies 80 m ahead
     assert not seen[1].any()  # no route
+
+
+def test_behind_the_goal_the_end_of_the_route_takes_its_place():
+    """The goal is at metre 90 of a route of 100 m, its end 40 m to the north of (60, 0); the car without a route keeps its goal."""
+    seen = observe(place=(60.0, 20.0), yaw=np.pi / 2, arc=80.0)
+    np.testing.assert_allclose(seen["ego"][0, :5], [0.1, 0, 0, 1, 0.1], atol=1e-6)
+    np.testing.assert_allclose(seen["far_goal"][0, :5], [0.2, 0, 0, 1, 0.2], atol=1e-6)
+    np.testing.assert_array_equal(seen["far_goal"][1], seen["ego"][1])
+    np.testing.assert_allclose([seen["route"][0, 2], seen["far_route"][0, 2]], [10 / 60, 20 / 70], rtol=1e-5)
 
 
 def test_lights_and_signs_ahead_of_the_front_come_in_the_order_of_the_route():

@@ -37,7 +37,7 @@ def glide() -> Dynamics:
     return Dynamics(init, advance, read)
 
 
-def build_env(config, *, draw=spawning.logged, steps=1500, respawn=None, ending=None, beside=None, hold=1):
+def build_env(config, *, draw=spawning.logged, steps=1500, respawn=None, ending=None, beside=None, hold=1, move=None):
     metrics = schema.read(config["step_metrics"], step_metrics.StepMetricsConfig)
     parts = environment.EnvParts(
         dynamics=glide(),
@@ -57,6 +57,7 @@ def build_env(config, *, draw=spawning.logged, steps=1500, respawn=None, ending=
         episode_steps=steps,
         control_dt=1 / 30,
         respawn_clearance_m=respawn,
+        move_action=move,
     )
     env = environment.assemble(parts)  # compiled: operations that run one by one are compiled one by one
     return env._replace(reset=jax.jit(env.reset), init_state=jax.jit(env.init_state), observe=jax.jit(env.observe))

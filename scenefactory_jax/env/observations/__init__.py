@@ -28,7 +28,14 @@ from scenefactory_jax.env.observations.reward_vector import reward_weights
 from scenefactory_jax.env.observations.road_set import road
 from scenefactory_jax.env.observations.route_neighbours import route_neighbours
 from scenefactory_jax.env.observations.route_vector import route
-from scenefactory_jax.env.observations.state_vectors import ego, friction_ahead, grade_ahead, weather, yaw_rate_and_steer
+from scenefactory_jax.env.observations.state_vectors import (
+    ego,
+    friction_ahead,
+    grade_ahead,
+    previous_action,
+    weather,
+    yaw_rate_and_steer,
+)
 from scenefactory_jax.env.observations.vmax import vmax_base, vmax_lane, vmax_road, vmax_segment
 
 __all__ = ["ANY", "FRACTION", "LENGTH", "SIGNED", "Group", "bound_observation", "make", "observe"]
@@ -43,6 +50,7 @@ __all__ += [
     "lights",
     "nearest_controls",
     "neighbours",
+    "previous_action",
     "reward_weights",
     "road",
     "route",

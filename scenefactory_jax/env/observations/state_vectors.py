@@ -15,15 +15,30 @@ from scenefactory_jax.weather.patches import read_condition
 
 
 @bound_observation(ANY, ANY, SIGNED, SIGNED, LENGTH, ANY, ANY)
-def ego(scene: Scene, state: State, *, distance_scale_m: Positive, speed_scale_mps: Positive) -> Float[Array, "A 7"]:
-    """Goal x, y in the car's frame; sine and cosine of its bearing; its distance; the car's velocity x, y (paper, section 4)."""
-    motion = state.motion
-    goal = to_frame(state.agents.goal - motion.position[:, :2], motion.yaw)
+def ego(
+    scene: Scene, state: State, *, distance_scale_m: Positive, speed_scale_mps: Positive, beyond_goal: bool = False
+) -> Float[Array, "A 7"]:
+    """Goal x, y in the car's frame; sine and cosine of its bearing; its distance; the car's velocity x, y (paper, section 4).
+
+    Args:
+        beyond_goal: as of `route`; the goal of an agent without a route stays.
+    """
+    motion, goal = state.motion, state.agents.goal
+    if beyond_goal and scene.routes.length.shape[0]:
+        end, _ = route_following.find_point(scene, state.agents.route, scene.routes.length[state.agents.route])
+        goal = jnp.where(route_following.find_routed(scene, state.agents)[:, None], end, goal)
+    goal = to_frame(goal - motion.position[:, :2], motion.yaw)
     distance = safe_norm(goal)
     bearing = goal / jnp.maximum(distance, 1e-6)[:, None]
     velocity = to_frame(motion.velocity[:, :2], motion.yaw)
     parts = [goal / distance_scale_m, bearing[:, 1:], bearing[:, :1], distance[:, None] / distance_scale_m, velocity / speed_scale_mps]
     return jnp.concatenate(parts, axis=1)
+
+
+@bound_observation(SIGNED)
+def previous_action(scene: Scene, state: State) -> Float[Array, "A 3"]:
+    """Throttle, steer and brake of the last action, from which `actions.rates` move."""
+    return state.previous_action
 
 
 @bound_observation(LENGTH, FRACTION)
