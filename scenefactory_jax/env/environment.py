@@ -7,7 +7,7 @@ pure functions for `jit`, `vmap` and `scan`.
 import dataclasses
 import functools
 from collections.abc import Callable, Mapping
-from typing import Any, Literal, NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -17,7 +17,7 @@ from scenefactory_jax.core import schema
 from scenefactory_jax.core.geometry import safe_norm
 from scenefactory_jax.core.instantiate import instantiate
 from scenefactory_jax.core.pytree import check, check_array, is_finite, replace, to_jax, to_strong_type, tree_where, unchecked
-from scenefactory_jax.core.schema import ConfigError, Count, NonNegative, Positive
+from scenefactory_jax.core.schema import ConfigError, NonNegative, Positive
 from scenefactory_jax.core.types import (
     Agents,
     Dynamics,
@@ -35,7 +35,7 @@ from scenefactory_jax.core.types import (
 )
 from scenefactory_jax.dynamics.collision import collect_boxes
 from scenefactory_jax.env import history, observations, rewards, route_following, spawning, step_metrics, termination, traffic
-from scenefactory_jax.env.actions import Rates, move
+from scenefactory_jax.env.action_settings import Actions
 from scenefactory_jax.env.history import HistorySpec
 from scenefactory_jax.roadgraph import elevation
 from scenefactory_jax.weather import friction, rain, road_condition
@@ -54,20 +54,6 @@ class Timing:
     def __post_init__(self) -> None:
         if episode_steps(vars(self)) < 1:
             raise ConfigError(f"episode_s: expected a control step, {1 / self.control_hz:g} s, or more, got {self.episode_s}")
-
-
-@dataclasses.dataclass(frozen=True)
-class Actions:
-    """The config group `actions`."""
-
-    command: dict[str, Any]  # an entry of `env.actions`
-    action_repeat: Count  # control steps per action
-    numbers: Literal[2, 3] = 3  # of an action that `command` reads, from the first on
-    rates: Rates | None = None  # the numbers of an action move those that `command` reads; None: they are these
-
-    def bind_rates(self, action_s: float) -> Callable[..., Float[Array, "A 3"]] | None:
-        """Binds `EnvParts.move_action`; `action_s`: between two actions."""
-        return self.rates and functools.partial(move, rates=self.rates, action_s=action_s)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -355,9 +341,7 @@ def _advance(parts: EnvParts, scene: Scene, state: State, action: Float[Array, "
         motion=motion,
         route=parts.advance_route(scene, state, motion, speed=safe_norm(motion.velocity[:, :2])),
         traffic=parts.traffic.advance(scene, state.traffic, cars, state.step),
-        history=history.record(
-            parts.history, state.history, state.motion, state.active, scene.traffic, state.step, state.previous_action
-        ),
+        history=history.record(parts.history, state.history, state.motion, state.active, scene.traffic, state.step, state.previous_action),
         weather=scene.weather,
         steps_since_spawn=state.steps_since_spawn + state.active.astype(jnp.int32),
         previous_action=action,

@@ -19,6 +19,7 @@ from scenefactory_jax.core.instantiate import instantiate
 from scenefactory_jax.core.schema import ConfigError, Count, NonNegative
 from scenefactory_jax.core.types import Boxes, Dynamics, RoadUser, Scene, Traffic
 from scenefactory_jax.env import environment, history, observations, rewards, route_following, spawning, step_metrics, termination
+from scenefactory_jax.env.action_settings import Actions
 from scenefactory_jax.env.environment import EnvParts
 from scenefactory_jax.env.termination import EventName, Termination
 from scenefactory_jax.env.traffic.log_playback import Row, make_masses, make_stateless, read_log
@@ -29,7 +30,7 @@ from scenefactory_jax.roadgraph.elevation import lift_boxes
 from scenefactory_jax.weather.road_condition import keep_condition
 
 # Groups of a policy's config that are read, besides `observations`
-READ = {"timing": environment.Timing, "actions": environment.Actions, "step_metrics": step_metrics.StepMetricsConfig}
+READ = {"timing": environment.Timing, "actions": Actions, "step_metrics": step_metrics.StepMetricsConfig}
 
 
 def policy_traffic(

@@ -15,7 +15,18 @@ from scenefactory_jax.core.instantiate import ConfigError
 from scenefactory_jax.core.pytree import replace
 from scenefactory_jax.core.track_interpolation import make_empty_boxes
 from scenefactory_jax.core.types import RewardInput
-from scenefactory_jax.env import actions, environment, observations, rewards, rollout, spawning, step_metrics, surrogate_safety, traffic
+from scenefactory_jax.env import (
+    action_settings,
+    actions,
+    environment,
+    observations,
+    rewards,
+    rollout,
+    spawning,
+    step_metrics,
+    surrogate_safety,
+    traffic,
+)
 from scenefactory_jax.env.observations.column_bounds import compress_length
 from scenefactory_jax.evaluation import episodes
 from scenefactory_jax.evaluation.failure_signals import SignalThresholds
@@ -603,8 +614,8 @@ def test_numbers_that_cannot_work_are_refused_by_name(override, message):
 
 def test_rates_move_pedals_and_steering(config):
     """Twice 0.1 s at 2/s up, then full rate down past zero, to a brake, and against the end."""
-    rates = actions.Rates(up_per_s=2.0, down_per_s=4.0, steer_per_s=1.5)
-    env = build_env(config, hold=3, move=functools.partial(actions.move, rates=rates, action_s=0.1))
+    rates = action_settings.Rates(up_per_s=2.0, down_per_s=4.0, steer_per_s=1.5)
+    env = build_env(config, hold=3, move=functools.partial(action_settings.move, rates=rates, action_s=0.1))
     scene = scene_of([[0, 0], [40, 0]], [[60, 0], [60, 0]], speeds=[1.0, 0.0])
     state, _ = env.reset(jax.random.key(0), scene)
     applied = []

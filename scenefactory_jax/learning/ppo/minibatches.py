@@ -71,9 +71,7 @@ def split_minibatches(
     return index.swapaxes(0, 1).reshape(minibatches, size)
 
 
-def count_left_out(
-    weight: Float[Array, " N"], total: Float[Array, ""], *, size: int, groups: int, axis: str | None
-) -> Float[Array, ""]:
+def count_left_out(weight: Float[Array, " N"], total: Float[Array, ""], *, size: int, groups: int, axis: str | None) -> Float[Array, ""]:
     """Computes the fraction of the samples with weight that minibatches with `size` samples in all leave out.
 
     Args:

@@ -1,0 +1,50 @@
+"""The config group `actions`. With `rates` an agent's numbers say how fast those that the command reads move."""
+
+import dataclasses
+import functools
+from collections.abc import Callable
+from typing import Any, Literal
+
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from scenefactory_jax.core.schema import Count, Positive
+
+
+@dataclasses.dataclass(frozen=True)
+class Rates:
+    """The key `rates` of the config group `actions`: what a number of 1 moves in a second."""
+
+    up_per_s: Positive  # throttle less brake, in [-1, 1]
+    down_per_s: Positive
+    steer_per_s: Positive
+
+
+@dataclasses.dataclass(frozen=True)
+class Actions:
+    """The config group `actions`."""
+
+    command: dict[str, Any]  # an entry of `env.actions`
+    action_repeat: Count  # control steps per action
+    numbers: Literal[2, 3] = 3  # of an action that `command` reads, from the first on
+    rates: Rates | None = None  # the numbers of an action move those that `command` reads; None: they are these
+
+    def bind_rates(self, action_s: float) -> Callable[..., Float[Array, "A 3"]] | None:
+        """Binds `EnvParts.move_action`; `action_s`: between two actions."""
+        return self.rates and functools.partial(move, rates=self.rates, action_s=action_s)
+
+
+def move(action: Float[Array, "A 3"], previous: Float[Array, "A 3"], *, rates: Rates, action_s: float) -> Float[Array, "A 3"]:
+    """Moves pedals and steering from where they are, for commands of one pedal: the third number is as it was given.
+
+    Gigaflow's cars (Cusumano-Towner et al. 2025, arXiv:2502.03349) choose their jerk in this way: noise on an action changes the driving
+    smoothly, and braking can build up faster than acceleration.
+
+    Args:
+        previous: throttle, steer and brake of the last action.
+        action_s: between two actions.
+    """
+    pedal, steer = previous[:, 0] - previous[:, 2], previous[:, 1]
+    rate = jnp.where(action[:, 0] > 0.0, rates.up_per_s, rates.down_per_s) * action[:, 0]
+    moved = jnp.stack([pedal + rate * action_s, steer + rates.steer_per_s * action_s * action[:, 1]], axis=1)
+    return jnp.concatenate([jnp.clip(moved, -1.0, 1.0), action[:, 2:]], axis=1)
