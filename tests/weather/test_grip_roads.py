@@ -142,3 +142,16 @@ def test_planners_see_the_smallest_friction_here_and_ahead(bend, weather):
         group = observations.make({"planning": entry}, control_dt=0.1, **({"friction": friction_of} if friction_of else {}))["planning"]
         seen = jax.jit(lambda scene, state, group=group: group(scene, state).mu)(bend, state)
         assert float(seen[0]) == pytest.approx(expected, rel=1e-3)
+
+
+def test_strips_come_by_chance_and_are_of_one_surface_in_an_episode(bend):
+    """Of 400 episodes a quarter has strips; each of the three surfaces is that of about a third of these."""
+    entry = {**CONFIG["weather"]["patches"]["routes"], "chance": 0.25, "instead": ["GRAVEL", "SNOW", "ICE"]}
+    sample = road_condition.make({**CONFIG["weather"], "patches": {"routes": entry}})
+    weather = jax.device_get(jax.jit(jax.vmap(sample, in_axes=(0, None)))(jax.random.split(jax.random.key(0), 400), bend))
+    present, surface = weather.patches.present, weather.patches.surface
+    assert not present[:, 1].any(), "the second car has no route"
+    assert 75 < present[:, 0].sum() < 125
+    assert (surface == surface[:, :1]).all()
+    names, counts = np.unique(surface[present[:, 0], 0], return_counts=True)
+    assert {SURFACES[index] for index in names} == {"GRAVEL", "SNOW", "ICE"} and counts.min() > 18
