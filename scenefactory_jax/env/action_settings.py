@@ -2,13 +2,13 @@
 
 import dataclasses
 import functools
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any, Literal
 
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from scenefactory_jax.core.schema import Count, Positive
+from scenefactory_jax.core.schema import ConfigError, Count, Positive
 
 
 @dataclasses.dataclass(frozen=True)
@@ -48,3 +48,13 @@ def move(action: Float[Array, "A 3"], previous: Float[Array, "A 3"], *, rates: R
     rate = jnp.where(action[:, 0] > 0.0, rates.up_per_s, rates.down_per_s) * action[:, 0]
     moved = jnp.stack([pedal + rate * action_s, steer + rates.steer_per_s * action_s * action[:, 1]], axis=1)
     return jnp.concatenate([jnp.clip(moved, -1.0, 1.0), action[:, 2:]], axis=1)
+
+
+def refuse_rates(config: Mapping[str, Any], *, what: str) -> None:
+    """Checks that the actions of a config are no rates.
+
+    Raises:
+        ConfigError: they are; `what` acts by pedals.
+    """
+    if rates := config.get("actions", {}).get("rates"):
+        raise ConfigError(f"actions.rates: expected null for {what}, which acts by pedals, got {rates}; valid: actions=one_pedal_10hz")

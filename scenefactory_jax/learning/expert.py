@@ -9,9 +9,10 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
 from scenefactory_jax.core.instantiate import instantiate
-from scenefactory_jax.core.schema import ConfigError, Fraction, NonNegative, Positive
+from scenefactory_jax.core.schema import Fraction, NonNegative, Positive
 from scenefactory_jax.core.types import Scene, State
 from scenefactory_jax.env import environment
+from scenefactory_jax.env.action_settings import refuse_rates
 from scenefactory_jax.env.observations.log_view import LogView
 from scenefactory_jax.learning.networks import late_fusion
 from scenefactory_jax.learning.rollout import Act, Disturb, Worlds
@@ -41,8 +42,7 @@ def make_expert(config: Mapping[str, Any]) -> Act | None:
     Raises:
         ConfigError: a planner that does not fit; actions that are rates, where what is imitated are pedals.
     """
-    if rates := config["actions"].get("rates"):
-        raise ConfigError(f"actions.rates: expected null for a learner that imitates, whose expert acts by pedals, got {rates}")
+    refuse_rates(config, what="a learner that imitates an expert")
     if config["learner"]["samples"] is not None:
         return None
     entry = set_action_time(config["learner"]["expert"], config)

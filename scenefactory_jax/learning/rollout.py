@@ -14,6 +14,7 @@ from scenefactory_jax.env import environment
 from scenefactory_jax.learning import replay_buffer
 from scenefactory_jax.learning.gaussian import log_probability
 from scenefactory_jax.learning.replay_buffer import Storage
+from scenefactory_jax.roadgraph import queries
 
 
 @pytree_dataclass
@@ -186,11 +187,9 @@ def choose_slots(
     """
 
     def choose(key: PRNGKeyArray, mask: Bool[Array, " P"]) -> Int[Array, " K"]:
-        slots = len(mask)
-        first = jax.random.randint(key, (), 0, slots)
-        turned = jnp.roll(mask, -first)
-        place = jnp.where(turned, jnp.cumsum(turned) - 1, count)
-        return jnp.full(count, slots).at[place].set((first + jnp.arange(slots)) % slots, mode="drop")
+        first = jax.random.randint(key, (), 0, len(mask))
+        index, found = queries.find_first_true(jnp.roll(mask, -first)[None], count=count)
+        return jnp.where(found[0], (first + index[0]) % len(mask), len(mask))
 
     return jax.vmap(choose)(sharding.world_keys(key, groups, axis), mask.reshape(groups, -1))
 

@@ -18,6 +18,7 @@ from scenefactory_jax.core.instantiate import ConfigError, instantiate, resolve_
 from scenefactory_jax.core.types import Env, Policy, Scene
 from scenefactory_jax.data.loading import scene_source, stream
 from scenefactory_jax.env import environment
+from scenefactory_jax.env.action_settings import refuse_rates
 from scenefactory_jax.learning import checkpoint, interrupt, past_policies, run_folder, run_paths, sample_stream
 from scenefactory_jax.learning.networks import late_fusion
 from scenefactory_jax.learning.ppo import train_iteration as ppo
@@ -158,8 +159,8 @@ def make_policy(config: Mapping[str, Any]) -> Policy:
     Raises:
         ConfigError: an entry that does not fit; a planner, which acts by pedals, where actions are rates.
     """
-    if "evaluation.planners" in str(config["policy"].get("_target_")) and (rates := config.get("actions", {}).get("rates")):
-        raise ConfigError(f"actions.rates: expected null for a planner, which acts by pedals, got {rates}; valid: actions=one_pedal_10hz")
+    if "evaluation.planners" in str(config["policy"].get("_target_")):
+        refuse_rates(config, what="a planner")
     names = {"dynamics": "dynamics", "observations": "observation_groups"}  # planners have numbers that are called observations
     context = {names[key]: config[key] for key in names if key in config}
     learner, actions = config.get("learner", {}), config.get("actions", {})

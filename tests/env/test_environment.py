@@ -613,7 +613,7 @@ def test_numbers_that_cannot_work_are_refused_by_name(override, message):
 
 
 def test_rates_move_pedals_and_steering(config):
-    """Twice 0.1 s at 2/s up, then full rate down past zero, to a brake, and against the end."""
+    """0.1 s each: the pedal moves by 2/s up and 4/s down from throttle less brake, and not beyond its end; the steering by 1.5/s."""
     rates = action_settings.Rates(up_per_s=2.0, down_per_s=4.0, steer_per_s=1.5)
     env = build_env(config, hold=3, move=functools.partial(action_settings.move, rates=rates, action_s=0.1))
     scene = scene_of([[0, 0], [40, 0]], [[60, 0], [60, 0]], speeds=[1.0, 0.0])
