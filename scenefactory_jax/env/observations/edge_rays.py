@@ -21,7 +21,8 @@ def edge_rays(
     edge. Edges of a road above or below are not seen.
 
     Args:
-        segments: of road edges, the nearest ones, that rays can meet; in whole chunks of `nearest_rows`.
+        segments: of road edges, the nearest ones, that rays can meet; in whole chunks of `nearest_rows`. Where more reach into the range,
+            as in intersections, rays pass through the others.
     """
     place, yaw = state.motion.position, state.motion.yaw
     near = gather_nearest(scene.edges, place[:, :2], yaw, count=segments, range_m=range_m)
