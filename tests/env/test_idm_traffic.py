@@ -388,6 +388,42 @@ def test_trajectory_idm_follows_the_track_and_brakes():
     assert chosen.reacts.tolist()[:3] == [True, False, False], "the first agent is at (20, 0): only the first is behind it within 15 m"
 
 
+def test_trajectory_idm_enters_where_there_is_room_and_walkers_wait():
+    """A vehicle whose track begins at 0.5 s, 8 m behind a car, and a pedestrian whose way another blocks; the cars leave after 1.5 s."""
+    scene = world(
+        {"at": [-8.0, 0.0], "velocity": [9.0, 0.0], "first": 5},
+        {"at": [0.0, 48.0], "velocity": [0.0, 1.5], "kind": "pedestrian"},
+    )
+    size = jnp.where(jnp.arange(SLOTS)[:, None] == 1, 0.7, scene.traffic_log.size)
+    scene = replace(scene, traffic_log=replace(scene.traffic_log, yaw=0 * scene.traffic_log.yaw, size=size))
+    gone = jax.tree.map(lambda leaf: jnp.concatenate([leaf, leaf]), car_far_away())
+    stand = {"position": jnp.array([[0.0, 0.0], [0.0, 50.0]]), "size": jnp.full((2, 2), WIDTH), "present": jnp.ones(2, bool)}
+    blocks = replace(gone, **stand)
+
+    @functools.partial(jax.jit, static_argnames="reactive")
+    def drive(scene, leaves, *, reactive):
+        kind = traffic.make(entry_of("trajectory_idm", reactive=reactive), control_dt=DT)
+
+        def body(state, step):
+            boxes = kind.read(scene, state, step)
+            cars = jax.tree.map(lambda near, far: jnp.where(step < leaves, near, far), blocks, gone)
+            return kind.advance(replace(scene, traffic=boxes), state, cars, step), boxes
+
+        return jax.device_get(jax.lax.scan(body, kind.init(jax.random.key(0), scene, jnp.int32(0)), jnp.arange(32))[1])
+
+    free, blocked = (drive(scene, jnp.int32(leaves), reactive="all") for leaves in (0, 15))
+    assert np.argmax(free.present[:, 0]) == 5, "with room it enters at its logged time"
+    assert np.argmax(blocked.present[:, 0]) == 16, "else once the car has gone"
+    np.testing.assert_allclose(blocked.position[16, 0], [-8.0 + 9.0 * DT * 5, 0.0], atol=1e-5)
+    walked = blocked.position[:, 1, 1]
+    assert walked[14] < 50.0 - 0.5 * WIDTH - 0.35, "the pedestrian stands before the car"
+    np.testing.assert_array_equal(blocked.velocity[14, 1], 0.0)
+    late = np.count_nonzero(np.diff(walked[:17]) == 0)
+    np.testing.assert_allclose(walked[17:30], free.position[17 - late : 30 - late, 1, 1], atol=1e-5)
+    as_logged = drive(scene, jnp.int32(15), reactive="metadrive")
+    np.testing.assert_allclose(as_logged.position[14, 1], [0.0, 48.0 + 1.4 * 1.5], atol=1e-5)
+
+
 def test_steps_are_deterministic_and_worlds_do_not_depend_on_each_other():
     scene = world({"route": "north", "arc": 90, "speed": 3.0}, {"route": "east", "arc": 90})
     alone, beside = run(scene)[0], run(scene, world({"route": "east", "arc": 60, "speed": 8.0}))[0]

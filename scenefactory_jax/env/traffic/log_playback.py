@@ -3,12 +3,13 @@
 Logged traffic neither brakes nor swerves for a car, and a collision does not move it.
 """
 
+import functools
 from collections.abc import Callable, Mapping
 from typing import Annotated
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from scenefactory_jax.core import track_interpolation
 from scenefactory_jax.core.pytree import replace
@@ -147,14 +148,17 @@ def read_log(
     start_row: int,
     elevation_m: float,
     control_dt: float,
+    late: Float[Array, " O"] | None = None,
 ) -> Boxes:
-    """Reads the boxes of logged road users at a control step, see `log_traffic`; `masses` are in the order of ROAD_USERS."""
+    """Reads the boxes of logged road users at a control step, see `log_traffic`; `masses` are in the order of ROAD_USERS. `late`: rows by
+    which each is behind its log; None: none is."""
     log, dt = scene.traffic_log, scene.log.dt
-    row = start_row + step.astype(jnp.float32) * (control_dt / dt)
+    row = jnp.broadcast_to(start_row + step.astype(jnp.float32) * (control_dt / dt), log.kind.shape)
+    row = row if late is None else row - late
     row = jnp.where(jnp.abs(row - jnp.round(row)) < track_interpolation.SNAP, jnp.round(row), row)
-    before, after = jax.vmap(lambda valid: track_interpolation.find_bracketing_rows(row, valid))(log.valid)
+    before, after = jax.vmap(track_interpolation.find_bracketing_rows)(row, log.valid)
     tracks = (log.position, log.yaw, log.velocity, log.valid)
-    position, velocity, yaw, yaw_rate = jax.vmap(lambda *track: track_interpolation.interpolate_track(row, *track, dt=dt))(*tracks)
+    position, velocity, yaw, yaw_rate = jax.vmap(functools.partial(track_interpolation.interpolate_track, dt=dt))(row, *tracks)
 
     started, ahead, at_row = before >= 0, after < log.valid.shape[1], before == row
     bridged = ahead & ((after - before) * dt <= gap_s + track_interpolation.SNAP * dt)

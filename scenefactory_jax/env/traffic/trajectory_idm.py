@@ -54,15 +54,27 @@ class Selection:
     min_rows: Count
 
 
-class TrackState(NamedTuple):
-    """State of the vehicles that follow their tracks; of the others it means nothing."""
+@dataclasses.dataclass(frozen=True)
+class Clearance:
+    """How far road users keep from cars where `reactive` is all."""
 
-    reacts: Bool[Array, " O"]
+    reaction_s: NonNegative
+    braking_mps2: Positive
+    margin_m: NonNegative
+
+
+class TrackState(NamedTuple):
+    """State of the road users; of vehicles that do not react only `skipped` means anything."""
+
+    reacts: Bool[Array, " O"]  # vehicles that follow their tracks
     skipped: Bool[Array, " O"]  # not on the road at all
     first: Int[Array, " O"]  # row of the log at which the vehicle enters
+    entered: Bool[Array, " O"]
     arc: Float[Array, " O"]  # along the track from that row on
     speed: Float[Array, " O"]
     action: Float[Array, " O"]  # -1: full brake, 1: full throttle
+    waits: Bool[Array, " O"]  # pedestrians and cyclists
+    late: Float[Array, " O"]  # rows for which they have waited
 
 
 class Track(NamedTuple):
@@ -77,6 +89,7 @@ def trajectory_idm_traffic(
     *,
     driving: TrackDriving,
     selection: Selection,
+    clearance: Clearance,
     reactive: Literal["metadrive", "all"],
     kinds: list[RoadUser],
     parked_m: NonNegative,
@@ -90,8 +103,10 @@ def trajectory_idm_traffic(
 
     Args:
         driving: how vehicles follow their tracks.
-        selection: see `reactive`.
-        reactive: metadrive: vehicles that move and begin behind the first agent, with its heading; all: every vehicle that moves.
+        selection, clearance: see `reactive`.
+        reactive: metadrive: vehicles that move and begin behind the first agent, with its heading; they enter wherever their track begins.
+            all: every vehicle that moves; one whose track begins later than the episode enters once there is room. Pedestrians and cyclists
+            follow their log, and wait while a car is in their way.
         kinds, parked_m, gap_s, mass_kg, start_row, elevation_m: as in `log_traffic`.
 
     Raises:
@@ -101,24 +116,33 @@ def trajectory_idm_traffic(
     numbers = {"parked_m": parked_m, "gap_s": gap_s, "start_row": start_row, "elevation_m": elevation_m, "control_dt": control_dt}
     hold = max(round(driving.hold_s / control_dt), 1)
 
+    def find_row(scene: Scene, step: Int[Array, ""]) -> Float[Array, ""]:
+        return start_row + step * (control_dt / scene.log.dt)
+
     def start(key: PRNGKeyArray, scene: Scene, step: Int[Array, ""]) -> TrackState:
         row = start_row + jnp.round(step * (control_dt / scene.log.dt)).astype(jnp.int32)
-        return init(scene, jnp.minimum(row, scene.traffic_log.valid.shape[1] - 1), selection, choose=reactive)
+        state = init(scene, jnp.minimum(row, scene.traffic_log.valid.shape[1] - 1), selection, choose=reactive)
+        return state._replace(entered=state.first <= find_row(scene, step))
 
     def move(scene: Scene, state: TrackState, cars: Boxes, step: Int[Array, ""]) -> TrackState:
         if scene.traffic_log.kind.shape[0] == 0:
             return state
-        row = start_row + step * (control_dt / scene.log.dt)
         due = (step + jnp.arange(len(state.arc))) % hold == 0
         boxes: Boxes = jax.tree.map(lambda a, b: jnp.concatenate([a, b]), scene.traffic, cars)
-        return advance(scene, state, boxes, row, due, driving, dt=control_dt)
+        moved = advance(scene, state, boxes, due, driving, dt=control_dt)
+        entered = state.first <= find_row(scene, step + 1)
+        if reactive == "metadrive":
+            return moved._replace(entered=entered)
+        waits = find_waiting(scene, cars, find_row(scene, step) - state.late, clearance)
+        late = state.late + jnp.where(waits, control_dt / scene.log.dt, 0.0)
+        return moved._replace(entered=state.entered | (entered & find_room(scene, state, boxes, clearance)), waits=waits, late=late)
 
     def read(scene: Scene, state: TrackState, step: Int[Array, ""]) -> Boxes:
-        logged = read_log(scene, step, kinds=kinds, masses=masses, **numbers)
+        late = None if reactive == "metadrive" else state.late
+        logged = read_log(scene, step, kinds=kinds, masses=masses, late=late, **numbers)
         if scene.traffic_log.kind.shape[0] == 0:
             return logged
-        row = start_row + step * (control_dt / scene.log.dt)
-        return read_boxes(scene.traffic_log, state, logged, row, driving.end_m)
+        return read_boxes(scene.traffic_log, state, logged, driving.end_m)
 
     return Traffic(start, move, read)
 
@@ -144,8 +168,9 @@ def init(scene: Scene, row: Int[Array, ""], selection: Selection, *, choose: str
         chosen, near = _compare_with_first_agent(scene, first, place, yaw, selection)
         reacts &= chosen
         skipped = (log.kind == VEHICLE) & (near | (jnp.sum(log.valid, axis=1) < selection.min_rows))
-    zero = jnp.zeros(len(reacts), jnp.float32)
-    return TrackState(reacts & ~skipped, skipped, first.astype(jnp.int32), zero, safe_norm(read(log.velocity)), zero)
+    zero, none = jnp.zeros(len(reacts), jnp.float32), jnp.zeros_like(reacts)
+    speed = safe_norm(read(log.velocity))
+    return TrackState(reacts & ~skipped, skipped, first.astype(jnp.int32), none, zero, speed, zero, none, zero)
 
 
 def _compare_with_first_agent(
@@ -190,9 +215,7 @@ def interpolate_track(track: Track, arc: Float[Array, "O K"]) -> tuple[Float[Arr
     return position + fraction[..., None] * (following - position), wrap_angle(yaw + fraction * turn)
 
 
-def advance(
-    scene: Scene, state: TrackState, boxes: Boxes, row: Float[Array, ""], due: Bool[Array, " O"], driving: TrackDriving, *, dt: float
-) -> TrackState:
+def advance(scene: Scene, state: TrackState, boxes: Boxes, due: Bool[Array, " O"], driving: TrackDriving, *, dt: float) -> TrackState:
     """Moves the vehicles that react by one control step; those that are due choose a new action."""
     log, law = scene.traffic_log, driving.law
     track = make_track(log, state.first)
@@ -215,7 +238,7 @@ def advance(
     demand = jnp.max(idm_law.compute_interaction(speed, distance, KMH * found.speed, law), axis=1, initial=0.0)
     target = jnp.full_like(state.speed, driving.target_kmh)
     wanted = jnp.clip(idm_law.compute_acceleration(KMH * state.speed, target, demand, law), -1.0, 1.0)
-    drives = state.reacts & (state.first <= row)
+    drives = state.reacts & state.entered
     action = jnp.where(due & drives, wanted, state.action)
     acceleration = jnp.where(action > 0, driving.full_throttle_mps2, driving.full_brake_mps2) * action
     new = jnp.maximum(state.speed + acceleration * dt, 0.0)
@@ -223,11 +246,47 @@ def advance(
     return state._replace(arc=jnp.where(drives, state.arc + way, state.arc), speed=jnp.where(drives, new, state.speed), action=action)
 
 
-def read_boxes(log: TrafficLog, state: TrackState, logged: Boxes, row: Float[Array, ""], end_m: float) -> Boxes:
+def find_room(scene: Scene, state: TrackState, boxes: Boxes, clearance: Clearance) -> Bool[Array, " O"]:
+    """Mask of the vehicles that can enter: neither they nor another box would have to brake harder than `braking_mps2` to stay apart."""
+    track = make_track(scene.traffic_log, state.first)
+    position, yaw = track.position[:, 0], track.yaw[:, 0]
+    size = scene.traffic_log.size + 2.0 * clearance.margin_m
+    velocity = state.speed[:, None] * heading_vector(yaw)
+    own = replace(scene.traffic, position=position, yaw=yaw, velocity=velocity, size=size, present=~state.entered)
+    ways = (_extend(moving, _find_stopping_way(moving, clearance)) for moving in (own, boxes))
+    return ~jnp.any(corridor.find_overlaps(*ways, leveled=scene.edges.height is not None), axis=1)
+
+
+def find_waiting(scene: Scene, cars: Boxes, row: Float[Array, " O"], clearance: Clearance) -> Bool[Array, " O"]:
+    """Mask of the pedestrians and cyclists at these rows with a car on the way of their next `reaction_s`; one that is hit goes on."""
+    log, leveled = scene.traffic_log, scene.edges.height is not None
+    nearest = jnp.clip(jnp.round(row).astype(jnp.int32), 0, log.valid.shape[1] - 1)
+    logged = jnp.take_along_axis(log.velocity, nearest[:, None, None], axis=1)[:, 0]
+    users = replace(scene.traffic, velocity=logged)  # also of those that wait
+    way = clearance.margin_m + clearance.reaction_s * safe_norm(users.velocity)
+    ahead = corridor.find_overlaps(_extend(users, way), cars, leveled=leveled)
+    touching = corridor.find_overlaps(users, cars, leveled=leveled)
+    return (log.kind != VEHICLE) & jnp.any(ahead & ~touching, axis=1)
+
+
+def _find_stopping_way(boxes: Boxes, clearance: Clearance) -> Float[Array, " B"]:
+    speed = safe_norm(boxes.velocity)
+    return clearance.reaction_s * speed + 0.5 * speed**2 / clearance.braking_mps2
+
+
+def _extend(boxes: Boxes, way: Float[Array, " B"]) -> Boxes:
+    """Lengthens boxes in the direction in which they move, or face."""
+    moves = safe_norm(boxes.velocity) > 0
+    yaw = jnp.where(moves, jnp.arctan2(boxes.velocity[:, 1], jnp.where(moves, boxes.velocity[:, 0], 1.0)), boxes.yaw)
+    size = boxes.size + way[:, None] * jnp.array([1.0, 0.0])
+    return replace(boxes, position=boxes.position + 0.5 * way[:, None] * heading_vector(yaw), yaw=yaw, size=size)
+
+
+def read_boxes(log: TrafficLog, state: TrackState, logged: Boxes, end_m: float) -> Boxes:
     """Reads the boxes of the vehicles that react, and of the others from their log."""
     track = make_track(log, state.first)
     position, yaw = (values[:, 0] for values in interpolate_track(track, state.arc[:, None]))
-    present = (state.first <= row) & (state.arc < track.arc[:, -1] - end_m)
+    present = state.entered & (state.arc < track.arc[:, -1] - end_m)
     boxes = replace(
         logged,
         position=position,
@@ -238,4 +297,5 @@ def read_boxes(log: TrafficLog, state: TrackState, logged: Boxes, row: Float[Arr
     )
     pick = lambda a, b: jnp.where(state.reacts.reshape(-1, *[1] * (a.ndim - 1)), a, b)  # noqa: E731
     chosen: Boxes = jax.tree.map(pick, boxes, logged)
-    return replace(chosen, present=chosen.present & ~state.skipped)
+    velocity = jnp.where(state.waits[:, None], 0.0, chosen.velocity)
+    return replace(chosen, velocity=velocity, present=chosen.present & ~state.skipped)
