@@ -25,12 +25,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from scenefactory_jax.core import pallas, schema
+from scenefactory_jax.core import schema
 from scenefactory_jax.core.geometry import cross, dot, safe_norm
 from scenefactory_jax.core.pytree import is_finite, replace
 from scenefactory_jax.core.schema import Bounds, ConfigError, NonNegative, Positive
 from scenefactory_jax.core.types import Boxes, Motion
-from scenefactory_jax.dynamics import contact_kernel
 
 OFF_CENTRE = 3.7  # effective mass of a contact at the middle of two cars' faces over that at their corners
 REPORT_S = 1e-3  # time step of forces that are reported and do not move cars
@@ -95,13 +94,12 @@ class ContactLaw:
     max_neighbours: Annotated[int, Bounds(min=0)]  # objects that a car may touch, beside other cars
 
 
-def make_contact(entry: Mapping[str, Any], *, height: float, step_s: float, kernels: bool = False) -> Contact:
+def make_contact(entry: Mapping[str, Any], *, height: float, step_s: float) -> Contact:
     """Makes the contact model of a config's `dynamics.contact`.
 
     Args:
         height: of the boxes, m; two whose elevations differ by more do not touch.
         step_s: time step of the forces, s.
-        kernels: Triton kernels for the pairs, on NVIDIA GPUs.
 
     Raises:
         ConfigError: a number out of range, or a contact too stiff for `step_s`, by name.
@@ -114,7 +112,7 @@ def make_contact(entry: Mapping[str, Any], *, height: float, step_s: float, kern
             f"4, got {load:.2f} at a time step of {step_s:.5f} s"
         )
     neighbours = functools.partial(find_neighbours, max_neighbours=law.max_neighbours)
-    return Contact(init, neighbours, functools.partial(compute_forces, law=law, height=height, step_s=step_s, kernels=kernels))
+    return Contact(init, neighbours, functools.partial(compute_forces, law=law, height=height, step_s=step_s))
 
 
 def init(cars: int, objects: int) -> ContactState:
@@ -169,7 +167,7 @@ def report_forces(contact: Contact, cars: Boxes, traffic: Boxes, seconds: float)
 
 
 def compute_forces(
-    axes: Axes, cars: Boxes, neighbours: Neighbours, *, law: ContactLaw, height: float, step_s: float, kernels: bool = False
+    axes: Axes, cars: Boxes, neighbours: Neighbours, *, law: ContactLaw, height: float, step_s: float
 ) -> tuple[Axes, Float[Array, "A 2"], Float[Array, " A"], Float[Array, " A"]]:
     """Computes the horizontal force and yaw torque on each car's box centre, and the largest force of a single pair, N and N m.
 
@@ -182,59 +180,39 @@ def compute_forces(
             not touch.
         neighbours: they follow their path and feel no force. If their mass is finite, the force is limited to what gives them the car's
             speed within `momentum_transfer_s`, and ends after that time.
-        kernels: as of `make_contact`.
     """
-    touch = functools.partial(compute_pair_force, law=law, height=height, step_s=step_s)
-    both = {"touch_car": functools.partial(touch, limited=False), "touch_object": functools.partial(touch, limited=True)}
-    operands = *axes, _sanitize(cars, law.mass), jax.vmap(functools.partial(_sanitize, mass=law.mass))(neighbours.boxes)
-    add_all = functools.partial(add_pairs, **both)
-    if kernels and neighbours.rows.shape[1] and pallas.on_gpu_by_default():
-        kernel = functools.partial(contact_kernel.compute_forces, scale_of_many=scale_of_many, **both)
-        add_all = functools.partial(pallas.dispatch, kernel, add_all)
-    cars_axis, beside_axis, force, torque, largest = add_all(*operands)
-    return Axes(cars_axis, beside_axis), force, torque, largest
-
-
-def add_pairs(
-    cars_axis: Int[Array, "A A"],
-    beside_axis: Int[Array, "A K"],
-    cars: Boxes,
-    beside: Boxes,
-    *,
-    touch_car: contact_kernel.PairForce,
-    touch_object: contact_kernel.PairForce,
-) -> tuple[Int[Array, "A A"], Int[Array, "A K"], Float[Array, "A 2"], Float[Array, " A"], Float[Array, " A"]]:
-    """Adds up the forces of all pairs: `contact_kernel.compute_forces` in plain JAX."""
-    count, objects = beside_axis.shape
+    touch = functools.partial(_compute_pair_force, law=law, height=height, step_s=step_s)
+    cars, (cars_axis, beside_axis), (count, objects) = _sanitize(cars, law.mass), axes, neighbours.rows.shape
     total, torque, largest, contacts = jnp.zeros((count, 2)), jnp.zeros(count), jnp.zeros(count), jnp.zeros(count)
     if objects:
         first = jax.tree.map(lambda leaf: jnp.repeat(leaf, objects, axis=0), cars)
-        second = jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), beside)
-        axis, pair_force, pair_torque, _ = jax.vmap(touch_object)(beside_axis.ravel(), first, second)
+        second = _sanitize(jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), neighbours.boxes), law.mass)
+        axis, pair_force, pair_torque, _ = jax.vmap(functools.partial(touch, limited=True))(beside_axis.ravel(), first, second)
         beside_axis = axis.reshape(count, objects)
         pair_force, pair_torque = pair_force.reshape(count, objects, 2), pair_torque.reshape(count, objects)
         contacts = (safe_norm(pair_force) > 0.0).sum(1, dtype=jnp.float32)
     if count > 1:
         rows_first, rows_second = np.triu_indices(count, 1)
         first, second = jax.tree.map(lambda leaf: leaf[rows_first], cars), jax.tree.map(lambda leaf: leaf[rows_second], cars)
-        axis, force, torque_first, torque_second = jax.vmap(touch_car)(cars_axis[rows_first, rows_second], first, second)
+        previous = cars_axis[rows_first, rows_second]
+        axis, force, torque_first, torque_second = jax.vmap(functools.partial(touch, limited=False))(previous, first, second)
         cars_axis = cars_axis.at[rows_first, rows_second].set(axis)
         rows = _find_pairs(count)
         contacts = contacts + jnp.tile(safe_norm(force) > 0.0, 2)[rows].sum(1, dtype=jnp.float32)
-        scale = scale_of_many(jnp.maximum(contacts[rows_first], contacts[rows_second]))
+        scale = _scale_of_many(jnp.maximum(contacts[rows_first], contacts[rows_second]))
         force = scale[:, None] * force
         total = jnp.concatenate([-force, force])[rows].sum(1)
         torque = jnp.concatenate([scale * torque_first, scale * torque_second])[rows].sum(1)
         largest = jnp.tile(safe_norm(force), 2)[rows].max(1)
     if objects:
-        scale = scale_of_many(contacts)[:, None]
+        scale = _scale_of_many(contacts)[:, None]
         force = scale[..., None] * pair_force
         total, torque = total - force.sum(1), torque + (scale * pair_torque).sum(1)
         largest = jnp.maximum(largest, safe_norm(force).max(1))
-    return cars_axis, beside_axis, total, torque, largest
+    return Axes(cars_axis, beside_axis), total, torque, largest
 
 
-def scale_of_many(contacts: Float[Array, "*n"]) -> Float[Array, "*n"]:
+def _scale_of_many(contacts: Float[Array, "*n"]) -> Float[Array, "*n"]:
     """Computes the scale of a pair's force where one of the two has this many contacts.
 
     N springs and dampers on one car add up to N times what the explicit integrator must carry: 16 cars at one position became NaN within a
@@ -243,7 +221,7 @@ def scale_of_many(contacts: Float[Array, "*n"]) -> Float[Array, "*n"]:
     return jnp.minimum(1.0, 2.0 / jnp.maximum(contacts, 1.0))
 
 
-def compute_pair_force(
+def _compute_pair_force(
     axis: Int[Array, ""], first: Boxes, second: Boxes, *, limited: bool, law: ContactLaw, height: float, step_s: float
 ) -> tuple[Int[Array, ""], Float[Array, "2"], Float[Array, ""], Float[Array, ""]]:
     """Computes the axis of a pair, the force on its second box (the first has the opposite), and the torques on both."""

@@ -7,16 +7,14 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import yaml
-from support.abstract_gpu import abstract_gpu
 from support.hand_scenes import column_of
 from support.running import ROOT
 
-from scenefactory_jax.core import schema
 from scenefactory_jax.core.instantiate import ConfigError
 from scenefactory_jax.core.pytree import replace
 from scenefactory_jax.core.track_interpolation import make_empty_boxes
 from scenefactory_jax.core.types import Boxes
-from scenefactory_jax.dynamics import collision, contact_kernel
+from scenefactory_jax.dynamics import collision
 
 pytestmark = pytest.mark.usefixtures("quickly")
 
@@ -502,48 +500,3 @@ def test_absent_boxes_of_no_size_give_no_nan(others):
     empty = jax.tree.map(lambda leaf: column_of(np.zeros((others, *leaf.shape[1:])), leaf.dtype), cars)
     for part in both(cars, empty):
         np.testing.assert_array_equal(part, 0.0)
-
-
-def draw_worlds(worlds, count, objects):
-    """Heaps of cars among objects, and axes as of some steps before."""
-    rng = np.random.default_rng(0)
-
-    def draw(*many):
-        normal = lambda *tail: rng.normal(size=(worlds, *many, *tail)).astype(np.float32)  # noqa: E731
-        size, mass = [4.0, 2.0] + 0.3 * np.abs(normal(2)), 1900.0 + 100.0 * normal()
-        parts = 4.0 * normal(2), 0.1 * normal(), 2.0 * normal(), 8.0 * normal(2), normal(), size, mass, normal() > -1.5
-        make = functools.reduce(lambda make, _: jax.vmap(make), many, Boxes)  # boxes have one axis
-        return make(*(jnp.asarray(part, bool if part.dtype == bool else jnp.float32) for part in parts))
-
-    axes = (jnp.asarray(rng.integers(-1, 8, (worlds, count, many)), jnp.int32) for many in (count, objects))
-    return *axes, draw(count), draw(count, objects)
-
-
-@functools.cache
-def make_pair_forces():
-    law = schema.read(NUMBERS, collision.ContactLaw)
-    touch = functools.partial(collision.compute_pair_force, law=law, height=1.0, step_s=DT)
-    return {"touch_car": functools.partial(touch, limited=False), "touch_object": functools.partial(touch, limited=True)}
-
-
-def test_the_kernel_adds_up_the_same_pairs():
-    """Sides of the tables that are no powers of two; the same to rounding."""
-    worlds = draw_worlds(20, 5, 3)
-    kernel = functools.partial(contact_kernel.compute_forces, scale_of_many=collision.scale_of_many, **make_pair_forces())
-    found = jax.jit(jax.vmap(functools.partial(kernel, interpret=True)))(*worlds)
-    expected = jax.jit(jax.vmap(functools.partial(collision.add_pairs, **make_pair_forces())))(*worlds)
-    for one, other in zip(found, expected, strict=True):
-        np.testing.assert_allclose(one, other, rtol=1e-4, atol=1e-5 * np.abs(other).max())
-    assert (np.asarray(expected[4]) > 0.0).mean() > 0.3
-
-
-def test_contacts_are_lowered_to_one_kernel(monkeypatch):
-    """For 16 cars and 4 objects, the numbers of the published configuration; not for worlds without objects."""
-    monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
-    model = collision.make_contact(NUMBERS, height=1.0, step_s=DT, kernels=True)
-    for objects, kernels in ((4, 1), (0, 0)):
-        axis, beside_axis, cars, boxes = draw_worlds(3, 16, objects)
-        beside = collision.Neighbours(boxes, jnp.zeros((3, 16, objects), jnp.int32))
-        with abstract_gpu():
-            program = jax.jit(jax.vmap(model.forces)).trace(collision.Axes(axis, beside_axis), cars, beside)
-            assert program.lower(lowering_platforms=("cuda",)).as_text().count("__gpu$xla.gpu.triton") == kernels

@@ -13,7 +13,6 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
-from scenefactory_jax.core import lanes
 from scenefactory_jax.core.geometry import heading_vector, safe_norm
 from scenefactory_jax.core.instantiate import ConfigError, instantiate
 from scenefactory_jax.core.pytree import pytree_dataclass, replace, tree_where
@@ -72,7 +71,6 @@ class CompiledCar(NamedTuple):
     rest_pose: np.ndarray  # qpos
     physics_dt: float
     substeps: int
-    kernels: bool = False
 
 
 def make(
@@ -85,7 +83,6 @@ def make(
     friction: Callable[..., Any],
     physics_dt: float,
     control_dt: float,
-    kernels: bool = False,
 ) -> Dynamics:
     """Makes the backend: cars with 10 joints each.
 
@@ -99,14 +96,13 @@ def make(
             `physics_dt`.
         friction: (weather, position, speed) -> positive friction coefficient, evaluated for every wheel at the start of every control step.
         physics_dt: s; `control_dt` must be a multiple of it.
-        kernels: Triton kernels for the closed-form step (on flat roads) and for contacts, on NVIDIA GPUs.
 
     Raises:
         ConfigError: an unknown or missing number by name, a spring too stiff for the time step, or time steps that do not fit.
     """
     parameters, settings = read_parameters({"car": car, "solver": solver})
-    compiled = compile_car(parameters, settings, abs_enabled=abs, physics_dt=physics_dt, control_dt=control_dt)._replace(kernels=kernels)
-    forces = collision.make_contact(contact, height=parameters.height, step_s=physics_dt, kernels=kernels)
+    compiled = compile_car(parameters, settings, abs_enabled=abs, physics_dt=physics_dt, control_dt=control_dt)
+    forces = collision.make_contact(contact, height=parameters.height, step_s=physics_dt)
     if randomization is not None:
         module = "scenefactory_jax.dynamics.articulated.randomization"
         entry = instantiate(randomization, builtins=module, where="dynamics.randomization", car=parameters, physics_dt=physics_dt)
@@ -210,7 +206,8 @@ def control_step(
     if mu.shape != wheels.shape[:-1] or not jnp.issubdtype(mu.dtype, jnp.floating):
         raise ConfigError(f"weather.friction: expected floating-point numbers {list(wheels.shape[:-1])}, got {mu.dtype} {list(mu.shape)}")
     command = actuators.compute_command(car, action)
-    step = make_step(compiled, body.constants, fields, scene.elevation)
+    each = None if body.constants is None else 0
+    step = jax.vmap(functools.partial(physics_step, compiled), in_axes=(each, 0, 0, 0, 0, 0, None))
     mass = equations_of_motion.total_mass(car)
     neighbours = contact.neighbours(collect_boxes(motion, scene.agents.size, active, mass), scene.traffic)
 
@@ -220,7 +217,7 @@ def control_step(
         beside = neighbours._replace(boxes=advance_boxes(neighbours.boxes, time))
         axes, force, torque, strength = contact.forces(axes, boxes, beside)
         carry = CarCarry(body.qpos, body.qvel, body.qacc_warmstart, body.tyres)
-        carry = step(carry, command, PlanarForce(force, torque), mu)
+        carry = step(constants, fields, carry, command, PlanarForce(force, torque), mu, scene.elevation)
         return (replace(body, **carry._asdict(), contact_force=jnp.maximum(body.contact_force, strength)), axes), None
 
     zero = jnp.zeros_like(body.contact_force)
@@ -230,25 +227,6 @@ def control_step(
     after = replace(after, contact=keep_axes(axes, neighbours, body.contact))
     still = replace(body.tyres, tangent=jnp.zeros_like(body.tyres.tangent), slip=jnp.zeros_like(body.tyres.slip))
     return tree_where(active, after, replace(body, contact_force=zero, tyres=still))
-
-
-def make_step(
-    compiled: CompiledCar, constants: CarConstants | None, fields: dict[str, Array], elevation: Elevation | None
-) -> Callable[[CarCarry, Command, PlanarForce, Float[Array, "A 4"]], CarCarry]:
-    """Makes the physics step of all cars. On flat roads the closed form may be a kernel.
-
-    Args:
-        constants: of cars that differ.
-        fields: of MJX's model, with a car axis, where cars differ.
-    """
-    if compiled.mjx_car is None and elevation is None:
-        map_cars = functools.partial(lanes.map_cases, name="step_car", enable=compiled.kernels)
-        if constants is None:
-            return functools.partial(map_cars, functools.partial(physics_step, compiled, compiled.constants, {}))
-        return functools.partial(map_cars, lambda own, *inputs: physics_step(compiled, own, {}, *inputs), constants)
-    axes = (None if constants is None else 0, 0, 0, 0, 0, 0, None)
-    map_cars = jax.vmap(functools.partial(physics_step, compiled), in_axes=axes)
-    return lambda *inputs: map_cars(constants or compiled.constants, fields, *inputs, elevation)  # pyright: ignore[reportCallIssue]
 
 
 def physics_step(
