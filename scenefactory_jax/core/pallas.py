@@ -24,11 +24,6 @@ def on_gpu(quick: Callable, plain: Callable, *arguments: Any) -> Any:
     return jax.lax.platform_dependent(*arguments, cuda=quick, default=plain)
 
 
-def on_gpu_by_default() -> bool:
-    """Whether this process computes on a GPU unless told otherwise. Elsewhere it need not trace a long kernel, which takes seconds."""
-    return jax.default_backend() == "gpu"
-
-
 def dispatch(kernel: Callable, plain: Callable, *operands: Any) -> Any:
     """Calls the kernel on NVIDIA GPUs and plain JAX elsewhere, with the derivative of plain JAX."""
 
