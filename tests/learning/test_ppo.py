@@ -406,6 +406,27 @@ def test_a_rollout_keeps_active_agents_first(course, kept, groups):
     assert len(list_rows(whole)) == whole.weight.sum() and len(list_rows(fewer)) == number and list_rows(fewer) <= list_rows(whole)
 
 
+def test_rewards_are_scaled_for_the_learner(course):
+    """With values in proportion, advantages and returns are."""
+    policy, env, stage = late_fusion.make(**SMALL), probe(life=5, episode_steps=4), scenes(WORLDS)
+    train_state = course[0].init(jax.random.key(0), stage)
+    plain, scaled = (
+        PPO(env, policy, ppo_config(horizon=2, normalize_advantages=False, **given)) for given in ({}, {"reward_scaling": 0.25})
+    )
+
+    @jax.jit
+    def compute(key):
+        samples = train_iteration.collect(plain, train_state, stage, key).samples
+        samples = unchecked(rollout.Sample, **vars(samples) | {"value": jnp.zeros_like(samples.value)})
+        last = jnp.ones(samples.value.shape[1:])
+        return train_iteration.compute_batch(plain, samples, 4.0 * last), train_iteration.compute_batch(scaled, samples, last)
+
+    one, other = compute(jax.random.key(1))
+    assert jnp.any(one.returns != 0.0)
+    for name in ("advantage", "returns"):
+        np.testing.assert_allclose(getattr(other, name), 0.25 * getattr(one, name), rtol=1e-6)
+
+
 def test_a_rollout_in_float16_holds_what_the_policy_saw(course):
     """Half the memory; a minibatch has it as float32 again."""
     policy, env, stage = late_fusion.make(**SMALL), probe(life=5, episode_steps=4), scenes(WORLDS)

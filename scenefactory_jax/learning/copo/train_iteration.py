@@ -78,7 +78,8 @@ def compute_advantages(
     copo: CoPO, samples: rollout.Sample, last_value: Float[Array, "W A 3"]
 ) -> tuple[Float[Array, "T W A 3"], Float[Array, "T W A 3"]]:
     """Computes advantages and returns of the three rewards, each with its own value."""
-    config, reward, active = copo.ppo.config, samples.reward, samples.active
+    config, active = copo.ppo.config, samples.active
+    reward = config.reward_scaling * samples.reward
     neighbourhood = coordination.compute_neighbourhood_reward(reward, active, samples.position, radius_m=copo.config.radius_m)
     rewards = jnp.stack([reward, neighbourhood, coordination.compute_global_reward(reward, active)], axis=-1)
     compute = functools.partial(gae.compute_gae, gamma=config.gamma, gae_lambda=config.gae_lambda)

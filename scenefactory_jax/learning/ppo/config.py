@@ -33,6 +33,9 @@ class PPOConfig:
     normalize_advantages: bool  # over the active samples of a rollout
     stagger_episodes: bool  # worlds start at random times of their episodes, so that they do not reach the time limit together
     parameter_ema_decay: Fraction | None  # of the running mean of the parameters, which is evaluated; None: the last parameters are
+    # of the rewards that are learnt from, as in Brax; those of metrics are not scaled. The gradient's norm is that of actor and critic:
+    # where returns are large, `max_grad_norm` bounds the critic's and leaves little of the actor's
+    reward_scaling: Positive = 1.0
 
     def __post_init__(self) -> None:
         if not self.learning_rate_min <= self.learning_rate <= self.learning_rate_max:

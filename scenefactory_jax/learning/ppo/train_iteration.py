@@ -117,7 +117,7 @@ def learn_batch(
 def compute_batch(ppo: PPO, samples: rollout.Sample, last_value: Float[Array, "W A"]) -> loss.Batch:
     """Computes advantages and returns of samples [T, W, A], as one flat batch, see `make_batch`."""
     advantage, returns = gae.compute_gae(
-        samples.reward,
+        ppo.config.reward_scaling * samples.reward,
         samples.value,
         last_value,
         samples.active,
