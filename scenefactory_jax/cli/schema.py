@@ -140,6 +140,7 @@ class Record(Task):
     iterations: Any
     minutes: Any
     checkpoint_every: Any
+    checkpoints_kept: Any
     loggers: Any
     evaluation: Any
 
@@ -189,7 +190,7 @@ class Baseline:
 
 @dataclass(frozen=True)
 class Benchmark(Learning):
-    """The command `benchmark`; `iterations`, `minutes` and `evaluation` are not read, so that experiments apply."""
+    """The command `benchmark`; what follows `baseline` is not read, so that experiments apply."""
 
     warmup: Seed
     repeats: Count
@@ -199,6 +200,8 @@ class Benchmark(Learning):
     baseline: Baseline | None
     iterations: Any
     minutes: Any
+    checkpoint_every: Any
+    checkpoints_kept: Any
     evaluation: Any
 
 

@@ -685,5 +685,7 @@ def test_episodes_are_described():
 @pytest.mark.parametrize("name", names("experiment"))
 def test_every_experiment_builds(name):
     builds(hydra_config.load_config("train", f"experiment={name}"))
-    measured, trained = (hydra_config.load_config(command, f"experiment={name}") for command in ("benchmark", "train"))
+    measured, recorded, trained = (hydra_config.load_config(command, f"experiment={name}") for command in ("benchmark", "record", "train"))
     assert measured["ppo"] == trained["ppo"]
+    schema.check(measured, schema.Benchmark)
+    schema.check(recorded, schema.Record)
