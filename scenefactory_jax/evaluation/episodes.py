@@ -94,7 +94,7 @@ def make_hook(
         boxes = env.current_scene(step.scene, state).traffic
         signals = update_signals(metrics.signals, metrics.past_events, lanes, boxes, before, state, result.metrics, thresholds)
         numbers = {"course": course, "control_dt": control_dt}
-        route = route_signals.update_signals(metrics.route, before, state, result.metrics, **numbers)
+        route = route_signals.update_signals(metrics.route, step.scene, before, state, result.metrics, **numbers)
         traffic = TrafficFrame(boxes.position, boxes.yaw, boxes.velocity, boxes.size, boxes.present)
         frame = EpisodeFrame(
             position=state.motion.position[:, :2],

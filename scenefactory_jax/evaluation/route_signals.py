@@ -2,7 +2,7 @@
 
 A clean completion (suite `route100`): the car passes gates every 20 m along its route, 2.5 m to either side, and the last one, at the goal,
 within 30 degrees of the route's direction, in 10 s and a second for every 4 m of the route; it has no other event, and drives the wrong way
-for one second at most.
+for one second at most. Time does not count while the car stands and the next light on its route, up to 50 m ahead, is red.
 """
 
 from dataclasses import dataclass
@@ -14,7 +14,8 @@ from jaxtyping import Array, Float, Int
 
 from scenefactory_jax.core.pytree import pytree_dataclass
 from scenefactory_jax.core.schema import Bounds, NonNegative, Positive
-from scenefactory_jax.core.types import State, StepMetrics
+from scenefactory_jax.core.types import Scene, State, StepMetrics
+from scenefactory_jax.env import route_following
 from scenefactory_jax.evaluation.records import EVENTS, Records
 
 
@@ -27,6 +28,8 @@ class CourseThresholds:
     goal_cosine: Annotated[float, Bounds(min=-1, max=1)]  # smallest between car and route at the goal
     start_s: NonNegative  # time limit: this and the route's length over the speed
     speed_mps: Positive
+    queue_m: NonNegative  # before a red light, in which the time limit does not run for a car that stands
+    stand_mps: NonNegative  # a slower car stands
     wrong_way_s: NonNegative
 
 
@@ -36,6 +39,7 @@ class RouteSignals:
 
     missed_gates: Int[Array, " A"]
     wrong_way_steps: Int[Array, " A"]
+    red_steps: Int[Array, " A"]  # waiting for a red light
     completion: Float[Array, " A"]  # part of the route, 0 to 1
     goal_alignment: Float[Array, " A"]  # cosine between car and route in the last step
     driven: Float[Array, " A"]  # m
@@ -45,11 +49,11 @@ class RouteSignals:
 def begin_signals(state: State) -> RouteSignals:
     """Returns the signals at the start of an episode."""
     zero, none = jnp.zeros(state.active.shape, jnp.float32), jnp.zeros(state.active.shape, jnp.int32)
-    return RouteSignals(none, none, zero, zero, zero, zero)
+    return RouteSignals(none, none, none, zero, zero, zero, zero)
 
 
 def update_signals(
-    signals: RouteSignals, before: State, after: State, metrics: StepMetrics, *, course: CourseThresholds, control_dt: float
+    signals: RouteSignals, scene: Scene, before: State, after: State, metrics: StepMetrics, *, course: CourseThresholds, control_dt: float
 ) -> RouteSignals:
     """Computes the signals after one more step, for the agents that are active in `before`."""
     active = before.active & ~metrics.events.numerical_error
@@ -58,10 +62,15 @@ def update_signals(
     gate = lambda arc: jnp.floor((arc - start) / course.gate_spacing_m)  # noqa: E731
     passes = gate(after.route.farthest) > gate(before.route.farthest)
     at_goal = metrics.events.goal_reached
+    lines = route_following.find_stop_lines(scene, after.agents, after.route.arc, after.step.astype(jnp.float32) * control_dt)
+    ahead = jnp.where(lines.distance > 0, lines.distance, jnp.inf)
+    nearest = jnp.min(ahead, axis=1, keepdims=True, initial=jnp.inf)
+    red = jnp.any(lines.red & (ahead == nearest) & (ahead <= course.queue_m), axis=1)
     missed = routed & (passes | at_goal) & (metrics.route_distance > course.gate_half_width_m)
     return RouteSignals(
         missed_gates=signals.missed_gates + missed.astype(jnp.int32),
         wrong_way_steps=signals.wrong_way_steps + (active & metrics.wrong_way).astype(jnp.int32),
+        red_steps=signals.red_steps + (routed & red & (metrics.speed < course.stand_mps)).astype(jnp.int32),
         completion=jnp.where(routed, metrics.route_completion, signals.completion),
         goal_alignment=jnp.where(routed, metrics.route_alignment, signals.goal_alignment),
         driven=signals.driven + jnp.where(active, metrics.speed * control_dt, 0.0),
@@ -76,7 +85,8 @@ def make_columns(signals: RouteSignals, records: Records, *, course: CourseThres
         signals: numpy rows, as those of `records`, which has `has_route`.
     """
     wrong_way_s = np.asarray(signals.wrong_way_steps) / control_hz
-    limit_s = course.start_s + records["route_m"] / course.speed_mps
+    red_s = np.asarray(signals.red_steps) / control_hz
+    limit_s = course.start_s + records["route_m"] / course.speed_mps + red_s
     others = np.any([records[name] for name in EVENTS if name != "goal_reached"], axis=0)
     arrived = records["goal_reached"] & (records["time_s"] <= limit_s) & (signals.goal_alignment >= course.goal_cosine)
     clean = arrived & (np.asarray(signals.missed_gates) == 0) & ~others & (wrong_way_s <= course.wrong_way_s)
@@ -85,6 +95,7 @@ def make_columns(signals: RouteSignals, records: Records, *, course: CourseThres
         "route_completion": np.where(records["goal_reached"] & records["has_route"], 1.0, signals.completion),
         "missed_gates": np.asarray(signals.missed_gates),
         "against_s": wrong_way_s,
+        "red_light_wait_s": red_s,
         "driven_m": np.asarray(signals.driven),
         "max_overspeed_mps": np.asarray(signals.overspeed),
         "clean_completion": clean & records["has_route"],

@@ -1,0 +1,48 @@
+"""Clean completions of routes: what the time limit counts."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from support.gliding import build_env
+from support.route_scenes import routed_scene
+
+from scenefactory_jax.cli.hydra_config import load_config
+from scenefactory_jax.core import schema
+from scenefactory_jax.core.types import LIGHT_STATES
+from scenefactory_jax.evaluation import route_signals
+from scenefactory_jax.evaluation.records import EVENTS
+
+pytestmark = pytest.mark.usefixtures("quickly")
+
+GO, STOP = (LIGHT_STATES.index(name) for name in ("go", "stop"))
+LINE = np.array([[-60.0, 0.0], [60.0, 0.0]])
+STEPS, DT, GREEN_S = 45, 1 / 30, 1.0
+
+
+def test_waiting_for_a_red_light_is_not_counted():
+    """Cars at rest 30 and 80 m before a light that is red for a second, one that drives towards it, and one behind it."""
+    config = load_config("task", "dynamics=bicycle")
+    env = build_env(config, ending=["numerical_error", "goal_reached"])
+    course = schema.read(load_config("evaluate")["failures"]["course"], route_signals.CourseThresholds)
+    lights = [((40.0, 0.0), [(0.0, STOP), (GREEN_S, GO)], np.inf)]
+    lines = [LINE + np.array([0.0, 4.0 * row]) for row in range(4)]
+    scene = routed_scene(lines, starts=[68.0, 18.0, 40.0, 105.0], speeds=[0, 0, 6, 0], controls=lights, stops=[[(100.0, 0)]] * 4)
+
+    @jax.jit
+    def drive(scene):
+        def step(carry, _):
+            state, signals = carry
+            after, result = env.step(scene, state, jnp.zeros((4, 3)))
+            return (after, route_signals.update_signals(signals, scene, state, after, result.metrics, course=course, control_dt=DT)), None
+
+        state = env.reset(jax.random.key(0), scene)[0]
+        return jax.lax.scan(step, (state, route_signals.begin_signals(state)), None, length=STEPS)[0][1]
+
+    signals = jax.device_get(drive(scene))
+    assert signals.red_steps.tolist() == [29, 0, 0, 0], "it is green in the 30th step"
+    records = {name: np.full(4, name == "goal_reached") for name in EVENTS} | {"has_route": np.ones(4, bool), "route_m": np.full(4, 40.0)}
+    for late, clean in ((0.0, True), (0.9, True), (1.1, False)):
+        records["time_s"] = np.full(4, course.start_s + 40.0 / course.speed_mps + late)
+        found = route_signals.make_columns(signals, records, course=course, control_hz=1 / DT)["clean_completion"]
+        assert found.tolist() == [clean, late == 0.0, late == 0.0, late == 0.0]
