@@ -379,7 +379,8 @@ class Env(NamedTuple):
 
 
 class Policy(NamedTuple):
-    """`apply(parameters, observation) -> (mean [..., 3], log_std [3], value [...])` for any leading axes; several values: [..., values].
+    """`apply(parameters, observation) -> (mean [..., 3], log_std [3] or [..., 3], value [...])` for any leading axes; several values:
+    [..., values].
 
     A logarithm of -inf is that of a policy without noise, as a planner; actions of a squashed Gaussian are sampled from `networks`.
     """

@@ -33,13 +33,16 @@ def clipped_log_probability(
     return jnp.sum(jnp.where(action <= -1.0, below, jnp.where(action >= 1.0, above, inside)), axis=-1)
 
 
-def entropy(log_std: Float[Array, " D"]) -> Float[Array, ""]:
+def entropy(log_std: Float[Array, "*batch D"]) -> Float[Array, "*batch"]:
     """Computes the differential entropy, nats."""
-    return jnp.sum(log_std + 0.5 * jnp.log(2.0 * jnp.pi * jnp.e))
+    return jnp.sum(log_std + 0.5 * jnp.log(2.0 * jnp.pi * jnp.e), axis=-1)
 
 
 def kl_divergence(
-    mean_old: Float[Array, "*batch D"], log_std_old: Float[Array, " D"], mean: Float[Array, "*batch D"], log_std: Float[Array, " D"]
+    mean_old: Float[Array, "*batch D"],
+    log_std_old: Float[Array, "*#batch D"],
+    mean: Float[Array, "*batch D"],
+    log_std: Float[Array, "*#batch D"],
 ) -> Float[Array, "*batch"]:
     """Computes KL(old || new), nats."""
     variance_ratio = jnp.exp(2.0 * (log_std_old - log_std))

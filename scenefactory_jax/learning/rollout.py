@@ -49,6 +49,7 @@ class Sample:
     observation: Observation  # of every slot, or with axes G, K of the slots in `kept`
     action: Float[Array, "W A 3"]  # before the environment's clipping
     mean: Float[Array, "W A 3"]
+    log_std: Float[Array, "W A 3"]
     log_probability: Float[Array, "W A"]
     value: Float[Array, "W A *values"]
     reward: Float[Array, "W A"]  # sum over the control steps
@@ -125,10 +126,11 @@ def collect_rollout(
         action = mean + jnp.exp(log_std) * sample_noise(action_key, mean, axis)
         worlds, outcome, counts = step_worlds(env, scenes, worlds, action, start_key, axis=axis)
         density, slots = log_probability(action, mean, log_std), None
+        log_std = jnp.broadcast_to(log_std, mean.shape)
         if kept is not None:
             slots = choose_slots(jax.random.fold_in(key, 2), outcome.active & ~outcome.truncated, groups=groups, count=kept, axis=axis)
             observation = jax.tree.map(lambda leaf: take_slots(leaf, slots), observation)
-        return worlds, (Sample(observation, action, mean, density, value, **vars(outcome), position=position, kept=slots), counts)
+        return worlds, (Sample(observation, action, mean, log_std, density, value, **vars(outcome), position=position, kept=slots), counts)
 
     worlds, (samples, counts) = jax.lax.scan(step, worlds, jax.random.split(key, horizon))
     return worlds, samples, jax.tree.map(jnp.sum, counts), count_episodes(counts)

@@ -74,7 +74,8 @@ def test_the_distribution_climbs_the_global_objective_of_the_next_policy():
         action = mean + jnp.exp(log_std) * jax.random.normal(keys[2], mean.shape)
         density = gaussian.log_probability(action, mean, log_std)
         advantage = jnp.where(weight[:, None], jax.random.normal(keys[3], (24, 3)), jnp.nan)
-        batch = loss.Batch(observation, action, mean, density, value, advantage[:, 0], value, jnp.asarray(weight, jnp.float32))
+        spread = jnp.broadcast_to(log_std, mean.shape)
+        batch = loss.Batch(observation, action, mean, spread, density, value, advantage[:, 0], value, jnp.asarray(weight, jnp.float32))
 
         def find_density(parameters):
             mean, log_std, _ = POLICY.apply(parameters, {"cue": observation["cue"][used]})

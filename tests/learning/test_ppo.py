@@ -67,10 +67,10 @@ def test_gaussians_agree_with_their_definitions():
     assert np.abs(kl_divergence(mean, log_std, mean, log_std)).max() == 0.0
 
 
-@pytest.fixture(scope="module")
-def batch():
+@pytest.fixture(scope="module", params=[False, True])
+def batch(request):
     """Policy, parameters and samples; every third one without weight."""
-    policy, count = late_fusion.make(**SMALL), 24
+    policy, count = late_fusion.make(**SMALL | {"actor_head_scale": 0.5}, state_dependent_std=request.param), 24
 
     @jax.jit
     def draw(key):
@@ -84,37 +84,39 @@ def batch():
             observation=observation,
             action=action,
             mean=old,
+            log_std=jnp.broadcast_to(log_std, old.shape),
             log_probability=gaussian.log_probability(action, old, log_std),
             value=value + 0.3 * jax.random.normal(keys[4], value.shape),
             advantage=jax.random.normal(keys[5], value.shape),
             returns=jax.random.normal(keys[6], value.shape),
             weight=(jnp.arange(count) % 3 > 0).astype(jnp.float32),
         )
-        return parameters, samples, log_std
+        return parameters, samples
 
     return policy, *draw(jax.random.key(3))
 
 
 def test_loss_equals_its_definition(batch):
-    policy, parameters, samples, log_std_old = batch
+    policy, parameters, samples = batch
     config = ppo_config(ent_coef=0.01, vf_coef=0.5)
-    total, metrics = jax.jit(functools.partial(loss.compute_loss, policy=policy, config=config))(parameters, samples, log_std_old)
+    total, metrics = jax.jit(functools.partial(loss.compute_loss, policy=policy, config=config))(parameters, samples)
     mean, log_std, estimate = (np.asarray(x, float) for x in jax.jit(policy.apply)(parameters, samples.observation))
+    log_std = np.broadcast_to(log_std, mean.shape)
     samples = jax.device_get(samples)
     surrogates, values = [], []
     for i in np.flatnonzero(np.asarray(samples.weight)):
-        now = stats.norm.logpdf(samples.action[i], mean[i], np.exp(log_std)).sum()
+        now = stats.norm.logpdf(samples.action[i], mean[i], np.exp(log_std[i])).sum()
         ratio, gain = np.exp(now - samples.log_probability[i]), float(samples.advantage[i])
         surrogates.append(min(ratio * gain, np.clip(ratio, 0.8, 1.2) * gain))
         old, target = float(samples.value[i]), float(samples.returns[i])
         values.append(max((estimate[i] - target) ** 2, (old + np.clip(estimate[i] - old, -0.2, 0.2) - target) ** 2))
-    entropy = 3 * 0.5 * np.log(2 * np.pi * np.e) + log_std.sum()
+    entropy = 3 * 0.5 * np.log(2 * np.pi * np.e) + log_std[np.asarray(samples.weight) > 0].sum(-1).mean()
     np.testing.assert_allclose(total, -np.mean(surrogates) + 0.5 * np.mean(values) - 0.01 * entropy, rtol=1e-4)
     assert 0.0 < float(metrics["clip_fraction"]) < 1.0
 
 
 def test_samples_without_weight_change_nothing(batch):
-    policy, parameters, samples, log_std = batch
+    policy, parameters, samples = batch
     empty, number = np.asarray(samples.weight == 0), lambda *arguments: jax.device_put(np.where(*arguments).astype(np.float32))
     garbage = dataclasses.replace(
         samples,
@@ -123,7 +125,7 @@ def test_samples_without_weight_change_nothing(batch):
         advantage=number(empty, np.nan, samples.advantage),
         returns=number(empty, 1e6, samples.returns),
     )
-    gradient = jax.jit(jax.grad(lambda p, b: loss.compute_loss(p, b, log_std, policy=policy, config=ppo_config(ent_coef=0.01))[0]))
+    gradient = jax.jit(jax.grad(lambda p, b: loss.compute_loss(p, b, policy=policy, config=ppo_config(ent_coef=0.01))[0]))
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=1e-6), gradient(parameters, garbage), gradient(parameters, samples))
     normalize, mean = jax.jit(loss.normalize_advantages), jax.jit(loss.weighted_mean)
     weight, none = samples.weight, np.zeros(24, np.float32)
@@ -138,8 +140,8 @@ def test_empty_slots_and_truncated_samples_have_no_weight():
     active, truncated = (jnp.asarray(rng.random((T, W, A)) < share) for share in (0.7, 0.3))
     observation, pair = {"cue": none[..., None]}, jnp.zeros((T, W, A, 3))
     samples = unchecked(  # with the axis of time before that of worlds
-        rollout.Sample, observation=observation, action=pair, mean=pair, log_probability=none, value=none, reward=none, active=active,
-        terminated=jnp.zeros((T, W, A), bool), truncated=truncated, position=pair[..., :2],
+        rollout.Sample, observation=observation, action=pair, mean=pair, log_std=pair, log_probability=none, value=none, reward=none,
+        active=active, terminated=jnp.zeros((T, W, A), bool), truncated=truncated, position=pair[..., :2],
     )  # fmt: skip
     ppo = PPO(probe(), late_fusion.make(**SMALL), ppo_config())
     batch = jax.jit(lambda samples: train_iteration.compute_batch(ppo, samples, samples.value[0]))(samples)
@@ -166,10 +168,10 @@ def test_left_out_samples_are_counted_for_each_group():
 
 def test_minibatches_that_are_not_finite_are_skipped_and_counted(batch):
     """Two minibatches of 12."""
-    policy, parameters, samples, log_std = batch
+    policy, parameters, samples = batch
     ppo = PPO(probe(), policy, ppo_config(epochs=1, minibatches=2, desired_kl=0.01, learning_rate=1e-3, permutation="once"))
     train_state = unchecked(TrainState, parameters=parameters, optimizer=ppo.optimizer.init(parameters), iteration=jnp.int32(0))
-    learn = jax.jit(lambda samples: train_iteration.update_epochs(ppo, train_state, samples, log_std, jax.random.key(6), size=12))
+    learn = jax.jit(lambda samples: train_iteration.update_epochs(ppo, train_state, samples, jax.random.key(6), size=12))
     broken = dataclasses.replace(samples, returns=samples.returns.at[1].set(jnp.nan))  # in one of the two minibatches
     after, state, metrics = learn(broken)
     assert float(metrics["skipped"]) == 1.0 and int(state[-1].count) == 1

@@ -121,8 +121,7 @@ def make_policy_pairs(imitation: Imitation, parameters: Any, collected: Collecte
     """Makes pairs `[T, W, A]` of a rollout, in the type of the expert's, or the rounding would tell them apart."""
     worlds, samples, *_ = collected
     after: Observation = jax.tree.map(lambda seen, last: jnp.concatenate([seen[1:], last[None]]), samples.observation, worlds.observation)
-    _, log_std, _ = imitation.ppo.policy.apply(parameters, worlds.observation)
-    density = find_density(imitation, samples.action, samples.mean, log_std)
+    density = find_density(imitation, samples.action, samples.mean, samples.log_std)
     weight = ppo_iteration.find_weight(samples)
     seen, after = (replay_buffer.compress(group, imitation.config.storage) for group in (samples.observation, after))
     return Pairs(seen, after, ~samples.terminated, density, weight)

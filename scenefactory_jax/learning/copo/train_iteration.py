@@ -58,11 +58,11 @@ def train_iteration(copo: CoPO, train_state: TrainState, scenes: Scene) -> tuple
     samples, ended = collected.samples, collected.samples.terminated | collected.samples.truncated
     factors, next_factors = coordination.follow_factors(learnt.parameters, train_state.buffer[NAME], ended, factor_key, axis=axis)
 
-    _, log_std, last_value = ppo.policy.apply(before, collected.worlds.observation)
+    last_value = ppo.policy.apply(before, collected.worlds.observation)[2]
     advantage, returns = compute_advantages(copo, samples, last_value)
     mixed = coordination.coordinate(advantage[..., INDIVIDUAL], advantage[..., NEIGHBOURHOOD], factors)
     batch = ppo_iteration.make_batch(ppo, samples, mixed, returns)
-    train_state, metrics = ppo_iteration.learn_batch(ppo, replace(train_state, key=key), collected, batch, log_std, update_key)
+    train_state, metrics = ppo_iteration.learn_batch(ppo, replace(train_state, key=key), collected, batch, update_key)
 
     advantage = flatten_kept(advantage, samples.kept, groups=ppo.groups)
     size = minibatch_size(ppo.config, collected.worlds.state.active.shape, groups=ppo.groups)

@@ -121,6 +121,15 @@ def split_gaussian(raw: Float[Array, "*batch twice"]) -> tuple[Float[Array, "*ba
     return mean, jax.nn.softplus(spread) + MIN_STD
 
 
+LOG_STD = (-4.0, 1.0)  # bounds of those that a network computes
+
+
+def split_deviation(outputs: Float[Array, "*batch D"]) -> tuple[Float[Array, "*batch M"], Float[Array, "*batch M"]]:
+    """Splits the outputs of an actor with a deviation for each state: mean, log_std."""
+    mean, log_std = jnp.split(outputs, 2, axis=-1)
+    return mean, jnp.clip(log_std, *LOG_STD)
+
+
 class Head(nn.Module):
     """Dense layers with activations between them, then a linear layer to the outputs; after the last of `hidden` there is an activation
     only with `activate_last`.

@@ -26,7 +26,7 @@ from scenefactory_jax.core.pallas import on_gpu
 from scenefactory_jax.core.schema import ConfigError, Count
 from scenefactory_jax.core.types import Observation, Policy, SetObservation
 from scenefactory_jax.learning.networks import set_kernel, squashed
-from scenefactory_jax.learning.networks.heads import ACTIVATIONS
+from scenefactory_jax.learning.networks.heads import ACTIVATIONS, split_deviation
 from scenefactory_jax.learning.networks.observation_blocks import check_groups
 
 
@@ -55,11 +55,12 @@ def make(
     actor_head_scale: float,
     dtype: Literal["float32", "bfloat16"],
     kernels: bool,
+    state_dependent_std: bool = False,
     actor: squashed.Actor = "gaussian",
     numbers: int = squashed.FULL,
     values: Count = 1,
 ) -> Policy:
-    """Builds two late-fusion towers and a state-independent log standard deviation, or a squashed actor and critics.
+    """Builds two late-fusion towers and a log standard deviation, or a squashed actor and critics.
 
     Args:
         vector: widths of the encoder of all vector groups.
@@ -73,6 +74,7 @@ def make(
             (Andrychowicz et al. 2021, "What matters in on-policy reinforcement learning?"). The published code has PyTorch's default.
         dtype: of products behind the first layer of an encoder; features, sums, parameters, means and values stay float32.
         kernels: Triton kernels for sets where there is an NVIDIA GPU; False: plain JAX.
+        state_dependent_std: the actor computes deviations, too, as in Brax; False, as published: they are the same in every state.
         actor, numbers: of the learner, and of an action; supplied. A squashed actor: `squashed.make` on the encoders, with the trunk as
             head, whose means and deviations before the tanh begin as above.
         values: of the critic, as the learner has them; supplied.
@@ -91,7 +93,7 @@ def make(
     first = {"mean_init": tuple(map(float, mean_init)), "log_std_init": float(log_std_init), "actor_head_scale": float(actor_head_scale)}
     encoder = functools.partial(Fusion, architecture)
     if actor == "gaussian":
-        network = ActorCritic(architecture, **first, values=values)
+        network = ActorCritic(architecture, **first, values=values, state_dependent_std=state_dependent_std)
         policy = Policy(network.init, squashed.fix_unread(network.apply, numbers), encoder=encoder)  # pyright: ignore[reportArgumentType]
     else:
         head = {"hidden": trunk, "activation": activation, "dtype": dtype, "activate_last": True}
@@ -115,12 +117,18 @@ class ActorCritic(nn.Module):
     log_std_init: float
     actor_head_scale: float
     values: int
+    state_dependent_std: bool
 
     @nn.compact
-    def __call__(self, observation: Observation) -> tuple[Float[Array, "*batch 3"], Float[Array, " 3"], Float[Array, "*batch_values"]]:
-        mean = Tower(self.architecture, head_bias=self.mean_init, head_scale=self.actor_head_scale, name="actor")(observation)
+    def __call__(self, observation: Observation) -> tuple[Float[Array, "*batch 3"], Float[Array, "*std 3"], Float[Array, "*batch_values"]]:
+        count = len(self.mean_init)
+        first = self.mean_init + (self.log_std_init,) * count * self.state_dependent_std
+        mean = Tower(self.architecture, head_bias=first, head_scale=self.actor_head_scale, name="actor")(observation)
         value = Tower(self.architecture, head_bias=(0.0,) * self.values, head_scale=1.0, name="critic")(observation)
-        log_std = self.param("log_std", nn.initializers.constant(self.log_std_init), (len(self.mean_init),), jnp.float32)
+        if self.state_dependent_std:
+            mean, log_std = split_deviation(mean)
+        else:
+            log_std = self.param("log_std", nn.initializers.constant(self.log_std_init), (count,), jnp.float32)
         return mean, log_std, value[..., 0] if self.values == 1 else value
 
 

@@ -122,7 +122,7 @@ def fix_unread(apply: Callable[..., Any], numbers: int) -> Callable[..., Any]:
 
     def apply_fixed(parameters: Any, observation: Observation) -> tuple[Array, Array, Array]:
         mean, log_std, value = apply(parameters, observation)
-        return mean.at[..., numbers:].set(0.0), log_std.at[numbers:].set(0.0), value
+        return mean.at[..., numbers:].set(0.0), log_std.at[..., numbers:].set(0.0), value
 
     return apply_fixed
 

@@ -25,6 +25,7 @@ class Batch:
     observation: Observation
     action: Float[Array, "N 3"]
     mean: Float[Array, "N 3"]
+    log_std: Float[Array, "N 3"]
     log_probability: Float[Array, " N"]
     value: Float[Array, "N *values"]
     advantage: Float[Array, " N"]
@@ -39,14 +40,13 @@ def take_minibatch(batch: Batch, index: Int[Array, " size"]) -> Batch:
 
 
 def compute_loss(
-    parameters: Any, batch: Batch, log_std_old: Float[Array, " 3"], *, policy: Policy, config: PPOConfig, axis: str | None = None
+    parameters: Any, batch: Batch, *, policy: Policy, config: PPOConfig, axis: str | None = None
 ) -> tuple[Float[Array, ""], dict[str, Float[Array, ""]]]:
     """Computes clipped surrogate + value loss - entropy bonus, and metrics; on several devices, each device's summand of them.
 
     The loss of several values is the sum of theirs.
 
     Args:
-        log_std_old: of the policy that acted.
         axis: mesh axis of the devices that share the samples.
     """
     mean, log_std, value = policy.apply(parameters, batch.observation)
@@ -73,7 +73,7 @@ def compute_loss(
         "policy_loss": policy_loss,
         "value_loss": value_loss,
         "entropy": entropy,
-        "kl": average(gaussian.kl_divergence(batch.mean, log_std_old, mean, log_std)),
+        "kl": average(gaussian.kl_divergence(batch.mean, batch.log_std, mean, log_std)),
         "clip_fraction": average((jnp.abs(ratio - 1.0) > clip_eps).astype(jnp.float32)),
     }
     return total, jax.lax.stop_gradient(metrics)

@@ -79,24 +79,24 @@ def collect(ppo: PPO, train_state: TrainState, scenes: Scene, key: PRNGKeyArray,
 
 def learn(ppo: PPO, train_state: TrainState, collected: Collected, key: PRNGKeyArray) -> tuple[TrainState, Metrics]:
     """Learns from a rollout: advantages, epochs of minibatches, metrics."""
-    _, log_std, last_value = ppo.policy.apply(train_state.parameters, collected.worlds.observation)
+    last_value = ppo.policy.apply(train_state.parameters, collected.worlds.observation)[2]
     batch = compute_batch(ppo, collected.samples, last_value)
-    train_state, metrics = learn_batch(ppo, train_state, collected, batch, log_std, key)
+    train_state, metrics = learn_batch(ppo, train_state, collected, batch, key)
     explained = loss.explained_variance(batch.value, batch.returns, batch.weight, axis=ppo.axis)
     return train_state, metrics | {"ppo/explained_variance": explained}
 
 
 def learn_batch(
-    ppo: PPO, train_state: TrainState, collected: Collected, batch: loss.Batch, log_std: Float[Array, " 3"], key: PRNGKeyArray
+    ppo: PPO, train_state: TrainState, collected: Collected, batch: loss.Batch, key: PRNGKeyArray
 ) -> tuple[TrainState, Metrics]:
-    """Learns from a rollout whose advantages are known: epochs of minibatches, metrics; `log_std`: of the policy that acted.
+    """Learns from a rollout whose advantages are known: epochs of minibatches, metrics.
 
     The metric `left_out`: fraction of the samples with weight that no minibatch holds.
     """
     config, axis = ppo.config, ppo.axis
     worlds, _, counts, scene_stats = collected
     size = minibatch_size(config, worlds.state.active.shape, groups=ppo.groups)
-    parameters, optimizer, metrics = update_epochs(ppo, train_state, batch, log_std, key, size=size)
+    parameters, optimizer, metrics = update_epochs(ppo, train_state, batch, key, size=size)
     total = jnp.sum(find_weight(collected.samples))
     metrics["left_out"] = count_left_out(batch.weight, total, size=size * config.minibatches, groups=ppo.groups, axis=axis)
     counts = sharding.sum_over_devices(counts, axis)
@@ -131,7 +131,8 @@ def compute_batch(ppo: PPO, samples: rollout.Sample, last_value: Float[Array, "W
 
 def make_batch(ppo: PPO, samples: rollout.Sample, advantage: Float[Array, "T W A"], returns: Float[Array, "T W A *values"]) -> loss.Batch:
     """Makes a flat batch of the samples [T, W, A] that were kept, with their advantages; groups of worlds follow one another."""
-    columns = samples.action, samples.mean, samples.log_probability, samples.value, advantage, returns, find_weight(samples)
+    acted = samples.action, samples.mean, samples.log_std, samples.log_probability, samples.value
+    columns = *acted, advantage, returns, find_weight(samples)
     observation = jax.tree.map(functools.partial(flatten, groups=ppo.groups), samples.observation)
     kept = functools.partial(flatten_kept, kept=samples.kept, groups=ppo.groups)
     batch = loss.Batch(observation, *jax.tree.map(kept, columns))
@@ -146,7 +147,7 @@ def find_weight(samples: rollout.Sample) -> Float[Array, "T W A"]:
 
 
 def update_epochs(
-    ppo: PPO, train_state: TrainState, batch: loss.Batch, log_std_old: Float[Array, " 3"], key: PRNGKeyArray, *, size: int
+    ppo: PPO, train_state: TrainState, batch: loss.Batch, key: PRNGKeyArray, *, size: int
 ) -> tuple[Any, optax.OptState, Metrics]:
     """Passes over the batch `epochs` times, in minibatches of `size` samples.
 
@@ -154,7 +155,7 @@ def update_epochs(
     gradient was not finite.
     """
     config = ppo.config
-    update = functools.partial(update_minibatch, ppo, batch, log_std_old, max_learning_rate(config, train_state.iteration))
+    update = functools.partial(update_minibatch, ppo, batch, max_learning_rate(config, train_state.iteration))
     groups = {"groups": ppo.groups, "axis": ppo.axis}
     split = functools.partial(split_minibatches, weight=batch.weight, size=size, minibatches=config.minibatches, **groups)
 
@@ -176,7 +177,6 @@ def update_epochs(
 def update_minibatch(
     ppo: PPO,
     batch: loss.Batch,
-    log_std_old: Float[Array, " 3"],
     max_rate: float | Float[Array, ""],
     carry: tuple[Any, optax.OptState],
     index: Int[Array, " size"],
@@ -185,7 +185,7 @@ def update_minibatch(
     parameters, optimizer = carry
     minibatch = loss.take_minibatch(batch, index)
     objective = functools.partial(loss.compute_loss, policy=ppo.policy, config=ppo.config, axis=ppo.axis)
-    result = jax.value_and_grad(objective, has_aux=True)(parameters, minibatch, log_std_old)
+    result = jax.value_and_grad(objective, has_aux=True)(parameters, minibatch)
     (total, metrics), gradient = sharding.sum_over_devices(result, ppo.axis)
     norm = optax.global_norm(gradient)
     adapted = jax.tree.map(lambda x: x, optimizer)  # a new dict of hyperparameters
