@@ -10,6 +10,7 @@ two networks can share one by mistake.
 """
 
 import functools
+import math
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
 
@@ -116,18 +117,21 @@ def _take_number(call: Callable[..., Array]) -> Callable[..., Array]:
 
 
 def split_gaussian(raw: Float[Array, "*batch twice"]) -> tuple[Float[Array, "*batch D"], Float[Array, "*batch D"]]:
-    """Splits an actor's output into the mean and the standard deviation, softplus(raw) + MIN_STD, of a Gaussian before its tanh."""
+    """Splits an actor's output into the mean and the standard deviation, softplus(raw) + MIN_STD, of a Gaussian."""
     mean, spread = jnp.split(raw, 2, axis=-1)
     return mean, jax.nn.softplus(spread) + MIN_STD
 
 
-LOG_STD = (-4.0, 1.0)  # bounds of those that a network computes
+def invert_deviation(log_std: float) -> float:
+    """Computes the output of which `split_gaussian` makes a standard deviation.
 
-
-def split_deviation(outputs: Float[Array, "*batch D"]) -> tuple[Float[Array, "*batch M"], Float[Array, "*batch M"]]:
-    """Splits the outputs of an actor with a deviation for each state: mean, log_std."""
-    mean, log_std = jnp.split(outputs, 2, axis=-1)
-    return mean, jnp.clip(log_std, *LOG_STD)
+    Raises:
+        ConfigError: one that is not above MIN_STD.
+    """
+    spread = math.exp(log_std) - MIN_STD
+    if spread <= 0.0:
+        raise ConfigError(f"policy.log_std_init: expected a number above the logarithm of {MIN_STD}, got {log_std}")
+    return math.log(math.expm1(spread))
 
 
 class Head(nn.Module):

@@ -26,7 +26,7 @@ from scenefactory_jax.core.pallas import on_gpu
 from scenefactory_jax.core.schema import ConfigError, Count
 from scenefactory_jax.core.types import Observation, Policy, SetObservation
 from scenefactory_jax.learning.networks import set_kernel, squashed
-from scenefactory_jax.learning.networks.heads import ACTIVATIONS, split_deviation
+from scenefactory_jax.learning.networks.heads import ACTIVATIONS, invert_deviation, split_gaussian
 from scenefactory_jax.learning.networks.observation_blocks import check_groups
 
 
@@ -121,12 +121,14 @@ class ActorCritic(nn.Module):
 
     @nn.compact
     def __call__(self, observation: Observation) -> tuple[Float[Array, "*batch 3"], Float[Array, "*std 3"], Float[Array, "*batch_values"]]:
-        count = len(self.mean_init)
-        first = self.mean_init + (self.log_std_init,) * count * self.state_dependent_std
+        count, first = len(self.mean_init), self.mean_init
+        if self.state_dependent_std:
+            first += (invert_deviation(self.log_std_init),) * count
         mean = Tower(self.architecture, head_bias=first, head_scale=self.actor_head_scale, name="actor")(observation)
         value = Tower(self.architecture, head_bias=(0.0,) * self.values, head_scale=1.0, name="critic")(observation)
         if self.state_dependent_std:
-            mean, log_std = split_deviation(mean)
+            mean, std = split_gaussian(mean)
+            log_std = jnp.log(std)
         else:
             log_std = self.param("log_std", nn.initializers.constant(self.log_std_init), (count,), jnp.float32)
         return mean, log_std, value[..., 0] if self.values == 1 else value

@@ -5,7 +5,6 @@ An action has 3 numbers, or the first 2 of them where the environment reads no m
 """
 
 import functools
-import math
 from collections.abc import Callable, Sequence
 from typing import Any, Literal, NamedTuple
 
@@ -17,7 +16,7 @@ from jaxtyping import Array, Float, PRNGKeyArray
 from scenefactory_jax.core.schema import ConfigError
 from scenefactory_jax.core.types import Observation, Policy
 from scenefactory_jax.learning import gaussian
-from scenefactory_jax.learning.networks.heads import MIN_STD, Encoder, Head, Network, make_critic, make_network, split_gaussian
+from scenefactory_jax.learning.networks.heads import Encoder, Head, Network, invert_deviation, make_critic, make_network, split_gaussian
 
 Actor = Literal["gaussian", "tanh_gaussian", "deterministic"]
 """gaussian: of PPO, not squashed."""
@@ -64,10 +63,7 @@ def make(
     is_random = actor == "tanh_gaussian"
     bias = [*mean_init[:numbers]]
     if is_random:
-        spread = math.exp(log_std_init) - MIN_STD
-        if spread <= 0.0:
-            raise ConfigError(f"policy.log_std_init: expected a number above the logarithm of {MIN_STD}, got {log_std_init}")
-        bias += [math.log(math.expm1(spread))] * numbers
+        bias += [invert_deviation(log_std_init)] * numbers
     last = nn.initializers.orthogonal(actor_head_scale), lambda *_: jnp.array(bias, jnp.float32)
     network = make_network(encoder, functools.partial(Head, tuple(hidden), len(bias), activation, dtype, *last, activate_last))
     critic = make_critic(encoder, 2, hidden=hidden, activation=activation, dtype=dtype, activate_last=activate_last)
