@@ -91,7 +91,8 @@ def draw_figure(summary: Mapping[str, Summary]) -> Figure:
 @matplotlib.rc_context(plots.STYLE)
 def draw_panels(labels: Sequence[str], summaries: Sequence[Summary], metrics: Sequence[str]) -> Figure:
     """Draws bars with 95 % intervals: a panel a metric, a bar a summary; "absent" where there is no value."""
-    figure = Figure(figsize=(1.0 + 1.9 * len(metrics), 0.34 * len(labels) + 1.0), layout="constrained")
+    wide = 0.3 + 0.075 * max(map(len, labels)) + 1.9 * len(metrics)
+    figure = Figure(figsize=(wide, 0.34 * len(labels) + 1.2), layout="constrained")
     panels = figure.subplots(1, len(metrics), sharey=True, squeeze=False)[0]
     for axes, name in zip(panels, metrics, strict=True):
         _draw_panel(axes, name, [summary.get(name) for summary in summaries])
@@ -114,6 +115,6 @@ def _draw_panel(axes: Axes, name: str, estimates: Sequence[Estimate | None]) -> 
         axes.text(max(end, 0.0) + 0.03 * span, place, f"{value:.2f}" if scale == 1.0 else f"{value:.1f}", va="center", fontsize=7.5)
     for place in set(range(len(estimates))) - set(places.tolist()):
         axes.text(0.03 * span, place, "absent", va="center", fontsize=7.5, color="#777777")
-    unit = " (%)" if scale == 100.0 else f" ({METRICS[name].unit})" if METRICS[name].unit else ""
-    axes.set(title=METRICS[name].label + unit, xlim=(1.05 * bottom, top + 0.35 * span))
+    unit = "%" if scale == 100.0 else METRICS[name].unit
+    axes.set(title=METRICS[name].label, xlabel=unit, xlim=(1.05 * bottom, top + 0.35 * span))
     axes.grid(False, axis="y")
