@@ -393,6 +393,7 @@ def test_trajectory_idm_enters_where_there_is_room_and_walkers_wait():
     scene = world(
         {"at": [-8.0, 0.0], "velocity": [9.0, 0.0], "first": 5},
         {"at": [0.0, 48.0], "velocity": [0.0, 1.5], "kind": "pedestrian"},
+        {"at": [-10.7, 0.0], "velocity": [9.0, 0.0], "first": 8},  # where the first has been three rows before
     )
     size = jnp.where(jnp.arange(SLOTS)[:, None] == 1, 0.7, scene.traffic_log.size)
     scene = replace(scene, traffic_log=replace(scene.traffic_log, yaw=0 * scene.traffic_log.yaw, size=size))
@@ -415,6 +416,7 @@ def test_trajectory_idm_enters_where_there_is_room_and_walkers_wait():
     assert np.argmax(free.present[:, 0]) == 5, "with room it enters at its logged time"
     assert np.argmax(blocked.present[:, 0]) == 16, "else once the car has gone"
     np.testing.assert_allclose(blocked.position[16, 0], [-8.0 + 9.0 * DT * 5, 0.0], atol=1e-5)
+    assert np.argmax(blocked.present[:, 2]) > 17, "of two that wait at one place one enters"
     walked = blocked.position[:, 1, 1]
     assert walked[14] < 50.0 - 0.5 * WIDTH - 0.35, "the pedestrian stands before the car"
     np.testing.assert_array_equal(blocked.velocity[14, 1], 0.0)

@@ -6,6 +6,7 @@ two PID controllers.
 """
 
 import dataclasses
+import functools
 from collections.abc import Callable
 from typing import Annotated, Literal, NamedTuple
 
@@ -130,12 +131,13 @@ def trajectory_idm_traffic(
         due = (step + jnp.arange(len(state.arc))) % hold == 0
         boxes: Boxes = jax.tree.map(lambda a, b: jnp.concatenate([a, b]), scene.traffic, cars)
         moved = advance(scene, state, boxes, due, driving, dt=control_dt)
-        entered = state.first <= find_row(scene, step + 1)
+        begun = state.first <= find_row(scene, step + 1)
         if reactive == "metadrive":
-            return moved._replace(entered=entered)
+            return moved._replace(entered=begun)
         waits = find_waiting(scene, cars, find_row(scene, step) - state.late, clearance)
         late = state.late + jnp.where(waits, control_dt / scene.log.dt, 0.0)
-        return moved._replace(entered=state.entered | (entered & find_room(scene, state, boxes, clearance)), waits=waits, late=late)
+        enters = find_entering(scene, state, boxes, begun & ~state.entered, clearance)
+        return moved._replace(entered=state.entered | enters, waits=waits, late=late)
 
     def read(scene: Scene, state: TrackState, step: Int[Array, ""]) -> Boxes:
         late = None if reactive == "metadrive" else state.late
@@ -246,15 +248,19 @@ def advance(scene: Scene, state: TrackState, boxes: Boxes, due: Bool[Array, " O"
     return state._replace(arc=jnp.where(drives, state.arc + way, state.arc), speed=jnp.where(drives, new, state.speed), action=action)
 
 
-def find_room(scene: Scene, state: TrackState, boxes: Boxes, clearance: Clearance) -> Bool[Array, " O"]:
-    """Mask of the vehicles that can enter: neither they nor another box would have to brake harder than `braking_mps2` to stay apart."""
+def find_entering(scene: Scene, state: TrackState, boxes: Boxes, begun: Bool[Array, " O"], clearance: Clearance) -> Bool[Array, " O"]:
+    """Mask of the vehicles that enter, of those whose track has begun: neither they nor another box would have to brake harder than
+    `braking_mps2` to stay apart. Of two that have begun at one place the first enters."""
     track = make_track(scene.traffic_log, state.first)
     position, yaw = track.position[:, 0], track.yaw[:, 0]
     size = scene.traffic_log.size + 2.0 * clearance.margin_m
     velocity = state.speed[:, None] * heading_vector(yaw)
-    own = replace(scene.traffic, position=position, yaw=yaw, velocity=velocity, size=size, present=~state.entered)
-    ways = (_extend(moving, _find_stopping_way(moving, clearance)) for moving in (own, boxes))
-    return ~jnp.any(corridor.find_overlaps(*ways, leveled=scene.edges.height is not None), axis=1)
+    own = replace(scene.traffic, position=position, yaw=yaw, velocity=velocity, size=size, present=begun)
+    way, ways = (_extend(moving, _find_stopping_way(moving, clearance)) for moving in (own, boxes))
+    overlaps = functools.partial(corridor.find_overlaps, leveled=scene.edges.height is not None)
+    order = state.first * len(begun) + jnp.arange(len(begun))
+    earlier = order < order[:, None]
+    return begun & ~jnp.any(overlaps(way, ways), axis=1) & ~jnp.any(overlaps(way, way) & earlier, axis=1)
 
 
 def find_waiting(scene: Scene, cars: Boxes, row: Float[Array, " O"], clearance: Clearance) -> Bool[Array, " O"]:
