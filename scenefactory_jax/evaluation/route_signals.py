@@ -2,7 +2,7 @@
 
 A clean completion (suite `route100`): the car passes gates every 20 m along its route, 2.5 m to either side, and the last one, at the goal,
 within 30 degrees of the route's direction, in 10 s and a second for every 4 m of the route; it has no other event, and drives the wrong way
-for one second at most. Time does not count while the car stands and the next light on its route, up to 50 m ahead, is red.
+for one second at most. Time does not count while the car stands and the next stop line on its route, up to 50 m ahead, has a red light.
 """
 
 from dataclasses import dataclass
@@ -15,7 +15,7 @@ from jaxtyping import Array, Float, Int
 from scenefactory_jax.core.pytree import pytree_dataclass
 from scenefactory_jax.core.schema import Bounds, NonNegative, Positive
 from scenefactory_jax.core.types import Scene, State, StepMetrics
-from scenefactory_jax.env import route_following
+from scenefactory_jax.env.observations.planning import read_stop_lines
 from scenefactory_jax.evaluation.records import EVENTS, Records
 
 
@@ -62,10 +62,9 @@ def update_signals(
     gate = lambda arc: jnp.floor((arc - start) / course.gate_spacing_m)  # noqa: E731
     passes = gate(after.route.farthest) > gate(before.route.farthest)
     at_goal = metrics.events.goal_reached
-    lines = route_following.find_stop_lines(scene, after.agents, after.route.arc, after.step.astype(jnp.float32) * control_dt)
-    ahead = jnp.where(lines.distance > 0, lines.distance, jnp.inf)
-    nearest = jnp.min(ahead, axis=1, keepdims=True, initial=jnp.inf)
-    red = jnp.any(lines.red & (ahead == nearest) & (ahead <= course.queue_m), axis=1)
+    lines = read_stop_lines(scene, after, after.step.astype(jnp.float32) * control_dt)
+    nearest = jnp.min(lines.distance, axis=1, keepdims=True, initial=course.queue_m)
+    red = jnp.any(lines.red & (lines.distance <= nearest), axis=1)
     missed = routed & (passes | at_goal) & (metrics.route_distance > course.gate_half_width_m)
     return RouteSignals(
         missed_gates=signals.missed_gates + missed.astype(jnp.int32),

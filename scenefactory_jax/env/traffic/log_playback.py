@@ -148,13 +148,12 @@ def read_log(
     start_row: int,
     elevation_m: float,
     control_dt: float,
-    late: Float[Array, " O"] | None = None,
+    late: Float[Array, " O"] | float = 0.0,
 ) -> Boxes:
     """Reads the boxes of logged road users at a control step, see `log_traffic`; `masses` are in the order of ROAD_USERS. `late`: rows by
-    which each is behind its log; None: none is."""
+    which each is behind its log."""
     log, dt = scene.traffic_log, scene.log.dt
-    row = jnp.broadcast_to(start_row + step.astype(jnp.float32) * (control_dt / dt), log.kind.shape)
-    row = row if late is None else row - late
+    row = jnp.broadcast_to(start_row + step.astype(jnp.float32) * (control_dt / dt) - late, log.kind.shape)
     row = jnp.where(jnp.abs(row - jnp.round(row)) < track_interpolation.SNAP, jnp.round(row), row)
     before, after = jax.vmap(track_interpolation.find_bracketing_rows)(row, log.valid)
     tracks = (log.position, log.yaw, log.velocity, log.valid)

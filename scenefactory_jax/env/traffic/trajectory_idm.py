@@ -140,8 +140,7 @@ def trajectory_idm_traffic(
         return moved._replace(entered=state.entered | enters, waits=waits, late=late)
 
     def read(scene: Scene, state: TrackState, step: Int[Array, ""]) -> Boxes:
-        late = None if reactive == "metadrive" else state.late
-        logged = read_log(scene, step, kinds=kinds, masses=masses, late=late, **numbers)
+        logged = read_log(scene, step, kinds=kinds, masses=masses, late=state.late, **numbers)
         if scene.traffic_log.kind.shape[0] == 0:
             return logged
         return read_boxes(scene.traffic_log, state, logged, driving.end_m)
