@@ -16,9 +16,10 @@ from jaxtyping import Array, Float, PRNGKeyArray
 
 from scenefactory_jax.core.geometry import safe_norm
 from scenefactory_jax.core.instantiate import instantiate
-from scenefactory_jax.core.schema import ConfigError, Fraction, NonNegative, Positive, Weight, read_value
+from scenefactory_jax.core.schema import ConfigError, Count, Fraction, NonNegative, Positive, Weight, read_value
 from scenefactory_jax.core.types import RewardInput
 from scenefactory_jax.env import route_following
+from scenefactory_jax.env.leaders import find_leaders
 from scenefactory_jax.env.termination import EventName
 
 Term = Callable[[RewardInput], Float[Array, " A"]]
@@ -38,6 +39,12 @@ Weights = Mapping[str, tuple[float | WeightRange, Term]]  # name -> (weight, ter
 def event(step: RewardInput, *, name: EventName) -> Float[Array, " A"]:
     """1 in the step in which the named event is new."""
     return getattr(step.events, name).astype(jnp.float32)
+
+
+def moving_collision(step: RewardInput, *, standing_mps: NonNegative) -> Float[Array, " A"]:
+    """1 in the step in which a collision is new, for a car that was faster than `standing_mps`: one that stands and is hit pays nothing."""
+    moved = safe_norm(step.before.motion.velocity[:, :2]) > standing_mps
+    return (step.events.collision & moved).astype(jnp.float32)
 
 
 def progress(step: RewardInput, *, limit_m: NonNegative) -> Float[Array, " A"]:
@@ -72,6 +79,27 @@ def stop_line_speed(step: RewardInput, *, braking_mps2: Positive, limit_mps: Pos
     room = jnp.min(jnp.where(demands, lines.distance, jnp.inf), axis=1, initial=jnp.inf)
     excess = safe_norm(state.motion.velocity[:, :2]) - jnp.sqrt(2.0 * braking_mps2 * room)
     return jnp.where(route_following.find_routed(step.scene, state.agents), jnp.clip(excess / limit_mps, 0.0, 1.0), 0.0)
+
+
+def leader_speed(
+    step: RewardInput,
+    *,
+    braking_mps2: Positive,
+    limit_mps: Positive,
+    look_ahead_m: Positive,
+    chord_m: Count,
+    margin_m: NonNegative,
+    foresight_s: NonNegative,
+) -> Float[Array, " A"]:
+    """Speed above that from which braking ends at the leader with the leader's speed, as a fraction of a limit, clamped to 1.
+
+    The allowed speed is sqrt(u^2 + 2 b d) at a gap d to a leader of the speed u, Gipps' of a driver without reaction time. Unlike the TTC
+    it lets a car come up to another, or wait before it, for nothing. The leader is that of the observation group `leader`.
+    """
+    strip = {"look_ahead_m": look_ahead_m, "chord_m": chord_m, "margin_m": margin_m, "foresight_s": foresight_s}
+    leader = find_leaders(step.scene, step.after, **strip)
+    allowed = jnp.sqrt(leader.speed**2 + 2.0 * braking_mps2 * jnp.maximum(leader.gap, 0.0))
+    return jnp.clip((safe_norm(step.after.motion.velocity[:, :2]) - allowed) / limit_mps, 0.0, 1.0)
 
 
 def against_traffic(step: RewardInput) -> Float[Array, " A"]:

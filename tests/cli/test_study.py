@@ -514,7 +514,7 @@ def test_a_study_of_a_mixture_is_whole(tmp_path):
     for one in plan.trainings:
         banks = one.config["stream"]["banks"]
         assert one.config["scenes"]["path"] is None and banks == {name: entry["banks"][name] for name in ("womd", "womd_links")}
-    assert len({steps_of(one.config) for one in plan.trainings}) == 1
+    assert len({steps_of(one.config) * one.config["scenes"]["pack"]["agents"] for one in plan.trainings}) == 1
     assert {one.condition for one in plan.evaluations if one.scores} == {"conflict"}
     for built in {one.program: one.config for one in plan.evaluations if one.condition == "grip 0.15"}.values():
         assert built["scenes"]["pack"]["starts"]["mu"] == built["weather"]["friction"]["surfaces"]["ICE"]["mu"] == 0.15

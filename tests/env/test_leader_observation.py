@@ -1,5 +1,7 @@
 """Groups `leader` and `route_neighbours`: two agents on one straight route, one on a crossing one, and boxes of the traffic."""
 
+import functools
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -10,8 +12,8 @@ from support.route_scenes import routed_scene
 from scenefactory_jax.adapters import bounds, flatten_observation
 from scenefactory_jax.cli.hydra_config import load_config
 from scenefactory_jax.core.pytree import replace
-from scenefactory_jax.core.types import Boxes, Events, Motion, RouteState, State
-from scenefactory_jax.env import observations
+from scenefactory_jax.core.types import Boxes, Events, Motion, RewardInput, RouteState, State
+from scenefactory_jax.env import environment, observations, rewards
 
 CONFIG = load_config("train", "observations=drive_crossings")["observations"]
 ENTRY, NEAR = CONFIG["leader"], CONFIG["crossings"]
@@ -31,8 +33,8 @@ def boxes_of(*rows):
     return Boxes(table[:, :2], zero, table[:, 2], table[:, 3:], zero, jnp.tile(jnp.array([4.0, 2.0]), (len(table), 1)), zero, zero == 0)
 
 
-def observe_all(speeds, boxes, active=(True, True, True)):
-    """What agents see at 10 and 30 m of the road east, and at 20 m of the road north."""
+def place_agents(speeds, boxes, active=(True, True, True)):
+    """The scene and the state of agents at 10 and 30 m of the road east, and at 20 m of the road north."""
     scene = replace(routed_scene([EAST, EAST, NORTH], starts=[10.0, 30.0, 20.0]), traffic=boxes_of(*boxes))
     agents, zero = scene.agents, jnp.zeros(3)
     place = jnp.concatenate([agents.position, zero[:, None]], axis=1)
@@ -53,7 +55,11 @@ def observe_all(speeds, boxes, active=(True, True, True)):
         key=jax.random.key(0),
         route=RouteState(agents.route_start, agents.route_start, none),
     )
-    seen = OBSERVE(scene, state)
+    return scene, state
+
+
+def observe_all(*args, **kwargs):
+    seen = OBSERVE(*place_agents(*args, **kwargs))
     low, high = bounds.flat_bounds(GROUPS, seen)
     flat = np.asarray(flatten_observation(seen))
     assert (flat >= low).all() and (flat <= high).all()
@@ -70,6 +76,24 @@ def test_the_nearest_box_on_the_route_leads():
     np.testing.assert_allclose(seen[0], [1.0, gap(16.0), 0.5, 0.3], rtol=1e-5)  # the other agent, 20 m ahead
     np.testing.assert_allclose(seen[1], [1.0, gap(26.0), 0.2, 0.3], rtol=1e-5)  # the box beside the route's line that is within its width
     np.testing.assert_allclose(seen[2], [0.0, 1.0, 0.0, 0.0])
+
+
+def test_speed_towards_the_leader_is_free_while_braking_ends_behind_it():
+    """Braking of 3 m/s^2 in a gap of 16 m: to 5 m/s from sqrt(25 + 96) = 11 m/s, to a stop from sqrt(96) = 9.80 m/s."""
+    strip = {"look_ahead_m": 40.0, "chord_m": 4, "margin_m": 0.2, "foresight_s": 1.0}
+    term = functools.partial(rewards.leader_speed, braking_mps2=3.0, limit_mps=3.0, **strip)
+    measure = environment.make_parts(load_config("task", "dynamics=bicycle")).compute_metrics
+
+    @jax.jit
+    def compute(scene, state):
+        return term(RewardInput(scene, state, state.previous_action, state, measure(scene, state, state), state.past_events))
+
+    for own, other, expected in ((10.9, 5.0, 0.0), (12.5, 5.0, 0.5), (20.0, 5.0, 1.0), (9.7, 0.0, 0.0), (11.3, 0.0, 0.5), (0.0, 0.0, 0.0)):
+        found = compute(*place_agents([own, other, 0.0], []))
+        np.testing.assert_allclose(found[0], expected, atol=2e-3)
+        assert found[1] == 0.0, "nothing is ahead"
+    alone = compute(*place_agents([20.0, 0.0, 0.0], [], active=(True, False, True)))
+    assert not np.asarray(alone).any()
 
 
 def test_a_box_that_crosses_within_the_foresight_leads_and_one_that_has_left_does_not():

@@ -123,6 +123,20 @@ def test_a_collision_costs_6_from_25_newtons_on_after_24_steps(force, age, costs
     assert paid([[0.0, 0.0]], [[0.2, 0.0]], force=force, age=age)["collision"] == costs
 
 
+def test_a_car_that_stands_and_is_hit_is_in_no_moving_collision():
+    """Two cars, of which the first stands."""
+    places = [[0.0, 0.0], [8.0, 0.0]]
+    scene = scene_of(places, FAR * 2)
+    metrics, *_ = judged(scene, places, places)
+    usual = dict(yaw=0.0, height=0.6, upright=1.0, force=0.0, age=100)
+    before = moment(scene, places, velocity=[[0.4, 0.0], [0.6, 0.0]], **usual)
+    after = moment(scene, places, velocity=[[3.0, 0.0], [0.0, 0.0]], **usual)
+    for collides, expected in ((True, [0.0, 1.0]), (False, [0.0, 0.0])):
+        events = dataclasses.replace(termination.make_empty_events(2), collision=jnp.full(2, collides))
+        step = RewardInput(scene, before, after.previous_action, after, metrics, events)
+        assert rewards.moving_collision(step, standing_mps=0.5).tolist() == expected
+
+
 @pytest.mark.parametrize(
     ("change", "costs"),
     [

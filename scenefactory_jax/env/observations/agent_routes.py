@@ -1,14 +1,11 @@
-"""The route that an agent's observation shows, and others along it."""
+"""The route that an agent's observation shows."""
 
-import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from scenefactory_jax.core.geometry import dot
-from scenefactory_jax.core.types import Agents, Boxes, Scene, State
-from scenefactory_jax.dynamics.collision import collect_boxes
+from scenefactory_jax.core.types import Agents, Scene
 from scenefactory_jax.env.route_following import find_routed
-from scenefactory_jax.env.traffic import corridor
 
 
 def select_routes(scene: Scene, agents: Agents) -> tuple[Int[Array, " A"], Bool[Array, " A"]]:
@@ -38,18 +35,3 @@ def sample_route_ahead(
     nearest = jnp.argmin(dot(offset, offset), axis=1)
     index = nearest[:, None] + 1 + gap * jnp.arange(1, count + 1)
     return points[route[:, None], jnp.minimum(index, points.shape[1] - 1)]
-
-
-def find_along_route(
-    scene: Scene, state: State, *, look_ahead_m: float, chord_m: int
-) -> tuple[Boxes, corridor.Window, corridor.Projection]:
-    """Finds where all boxes, of the active agents and the traffic after them, lie along the route ahead of each agent.
-
-    Args:
-        look_ahead_m: length of the route that is searched, read as chords of `chord_m` points.
-    """
-    cars = collect_boxes(state.motion, state.agents.size, state.active, jnp.inf)
-    boxes: Boxes = jax.tree.map(lambda *leaves: jnp.concatenate(leaves), cars, scene.traffic)
-    points = max(int(look_ahead_m // chord_m), 1) + 1
-    window = corridor.read_window(scene.routes, state.agents.route, state.route.arc, points=points, stride=chord_m)
-    return boxes, window, corridor.project_boxes(window, boxes)

@@ -6,10 +6,8 @@ from jaxtyping import Array, Float
 from scenefactory_jax.core.geometry import safe_norm
 from scenefactory_jax.core.schema import Count, NonNegative, Positive
 from scenefactory_jax.core.types import Scene, State
-from scenefactory_jax.env import route_following
-from scenefactory_jax.env.observations.agent_routes import find_along_route
+from scenefactory_jax.env.leaders import find_leaders
 from scenefactory_jax.env.observations.column_bounds import ANY, FRACTION, LENGTH, SIGNED, bound_observation, compress_length
-from scenefactory_jax.env.traffic import corridor
 
 COLUMNS = 4
 
@@ -36,19 +34,9 @@ def leader(
         look_ahead_m: length of the route that is searched, read as chords of `chord_m` points.
         margin_m: by which the strip is wider than the agent, on both sides.
     """
-    agents, motion = state.agents, state.motion
+    found = find_leaders(scene, state, look_ahead_m=look_ahead_m, chord_m=chord_m, margin_m=margin_m, foresight_s=foresight_s)
+    closing = safe_norm(state.motion.velocity[:, :2]) - found.speed
+    gap = compress_length(found.gap, gap_scale_m)
+    columns = [jnp.ones_like(gap), gap, found.speed / speed_scale_mps, closing / speed_scale_mps]
     free = jnp.zeros((len(state.active), COLUMNS), jnp.float32).at[:, 1].set(1.0)
-    if not corridor.has_routes(scene.routes):
-        return free
-    arc = state.route.arc
-    boxes, _, places = find_along_route(scene, state, look_ahead_m=look_ahead_m, chord_m=chord_m)
-    strip = {"arc": arc, "size": agents.size, "margin_m": margin_m, "foresight_s": jnp.full(len(boxes.mass), foresight_s)}
-    found = corridor.find_obstacles(places, boxes, **strip, shift=jnp.zeros_like(places.offset))
-    own = jnp.arange(len(boxes.mass)) == jnp.arange(len(arc))[:, None]
-    gap = jnp.where(own, jnp.inf, found.gap)
-    nearest = jnp.argmin(gap, axis=1)[:, None]
-    distance, speed = (jnp.take_along_axis(table, nearest, axis=1)[:, 0] for table in (gap, found.speed))
-    closing = safe_norm(motion.velocity[:, :2]) - speed
-    columns = [jnp.ones_like(speed), compress_length(distance, gap_scale_m), speed / speed_scale_mps, closing / speed_scale_mps]
-    known = jnp.isfinite(distance) & route_following.find_routed(scene, agents)
-    return jnp.where(known[:, None], jnp.stack(columns, axis=1), free)
+    return jnp.where(jnp.isfinite(found.gap)[:, None], jnp.stack(columns, axis=1), free)

@@ -7,7 +7,7 @@ from scenefactory_jax.core.geometry import SMALLEST, dot, safe_norm
 from scenefactory_jax.core.schema import Count, NonNegative, Positive
 from scenefactory_jax.core.types import Boxes, Scene, SetObservation, State
 from scenefactory_jax.env import route_following
-from scenefactory_jax.env.observations.agent_routes import find_along_route
+from scenefactory_jax.env.leaders import find_along_route
 from scenefactory_jax.env.observations.column_bounds import (
     ANY,
     FRACTION,
