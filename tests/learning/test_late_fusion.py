@@ -115,8 +115,8 @@ def test_empty_sets_read_zero_and_all_gradients_stay_finite(tiny):
 
 
 @pytest.mark.parametrize("activation", sorted(late_fusion.ACTIVATIONS))
-@pytest.mark.parametrize("widths", [(6,), (6, 4)])
-def test_gradient_through_the_winners_is_the_plain_gradient(activation, widths):
+@pytest.mark.parametrize("widths", [(6,), (6, 4), (6, 32), (6, 8, 32)])
+def test_gradient_through_the_winners_or_through_few_rows_is_the_plain_gradient(activation, widths):
     road = observe(2)["road"]
     rng = np.random.default_rng(3)
     normal = lambda *shape: jax.device_put(rng.normal(size=shape).astype(np.float32))  # noqa: E731

@@ -89,7 +89,7 @@ def test_supported_layers(sizes, made):
 @pytest.mark.parametrize("dtype", ["float32", "bfloat16"])
 def test_a_gpu_gets_kernels_and_other_devices_plain_jax(dtype):
     weights = layers(0, 5, 96, 96)
-    x, mask = sets(1, batch=(4,), rows=40, features=5)
+    x, mask = sets(1, batch=(4,), rows=60, features=5)
 
     def text(kernels, platform):
         loss = jax.jit(jax.grad(lambda weights: late_fusion.encode_set("elu", dtype, kernels, weights, x, mask).sum()))

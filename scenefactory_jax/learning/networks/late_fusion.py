@@ -5,8 +5,9 @@ each set of rows has its own row encoder and is max-pooled over the rows of its 
 vector joins the vector encoder, a set gets an encoder of `rows_default` widths.
 
 Rows are pooled before the last activation, which gives the same since activations increase. A pooled channel depends on one row, its
-winner, so that the gradient recomputes the winners and stores no activation of other rows: exact, in less time and memory. On NVIDIA GPUs
-encoders of two layers run as one kernel (`set_kernel`), which is tested against the plain JAX here.
+winner, so that the gradient recomputes the winners and stores no activation of other rows: exact, in less time and memory. Sets with fewer
+rows than winners recompute all rows. On NVIDIA GPUs encoders of two layers run as one kernel where rows are many (`set_kernel`), which is
+tested against the plain JAX here.
 
 Differences from the published code, which follow the paper instead: no LayerNorm, no extra 64 to 64 layer before the heads.
 """
@@ -234,7 +235,13 @@ def _winners(activation: str, dtype: str, kernels: bool, weights: list, x: Array
             return pool(rows, mask), jnp.zeros((*mask.shape[:-1], rows.shape[-1]), jnp.int32)
         return pool(rows, mask), jnp.argmax(jnp.where(mask[..., None], rows, -jnp.inf), axis=-2).astype(jnp.int32)
 
-    return _on(kernels and set_kernel.fits(weights), functools.partial(set_kernel.encode, activation, dtype), plain, weights, x, mask)
+    quick = functools.partial(set_kernel.encode, activation, dtype)
+    return _on(kernels and not _has_few_rows(weights, mask) and set_kernel.fits(weights), quick, plain, weights, x, mask)
+
+
+def _has_few_rows(weights: list, mask: Bool[Array, "*batch K"]) -> bool:
+    """Whether the gradient through all rows takes less time than through the winner of each channel: rows need no gather."""
+    return 2 * mask.shape[-1] <= weights[-1][0].shape[1]
 
 
 def _on(kernel: bool, quick: Callable, plain: Callable, *arguments: Any) -> Any:
@@ -243,12 +250,15 @@ def _on(kernel: bool, quick: Callable, plain: Callable, *arguments: Any) -> Any:
 
 def _encode_forward(activation: str, dtype: str, kernels: bool, weights: list, x: Array, mask: Array) -> tuple[Array, tuple]:
     pooled, winner = _winners(activation, dtype, kernels, weights, x, mask)
-    return pooled, (weights, x, winner, jnp.any(mask, axis=-1)[..., None])
+    return pooled, (weights, x, winner, mask)
 
 
 def _encode_backward(activation: str, dtype: str, kernels: bool, residuals: tuple, cotangent: Array) -> tuple[list, Array, None]:
-    weights, x, winner, has_rows = residuals
-    cotangent = jnp.where(has_rows, cotangent, 0.0)
+    weights, x, winner, mask = residuals
+    cotangent = jnp.where(jnp.any(mask, axis=-1)[..., None], cotangent, 0.0)
+    if _has_few_rows(weights, mask):
+        won = winner[..., None, :] == jnp.arange(mask.shape[-1])[:, None]
+        return *_affine_backward(activation, dtype, weights, x, jnp.where(won, cotangent[..., None, :], 0.0)), None
 
     def at_winners(weights: list, x: Array) -> Array:
         rows = jnp.take_along_axis(x, winner[..., None], axis=-2)  # [..., G, F]: the winner of each channel
@@ -267,3 +277,21 @@ def _encode_backward(activation: str, dtype: str, kernels: bool, residuals: tupl
 
 
 encode_set.defvjp(_encode_forward, _encode_backward)
+
+
+def _affine_backward(
+    activation: str, dtype: str, weights: list, x: Float[Array, "*batch F"], cotangent: Float[Array, "*batch G"]
+) -> tuple[list, Float[Array, "*batch F"]]:
+    """Computes the gradient of `affine`, with hidden values anew, and with products in `dtype`, where JAX's own has float32."""
+    inputs, activations = [x], []
+    for layer in weights[:-1]:
+        hidden, back = jax.vjp(ACTIVATIONS[activation], affine(activation, dtype, [layer], inputs[-1]))
+        inputs.append(hidden.astype(dtype))
+        activations.append(back)
+    gradients, product = [], functools.partial(jnp.einsum, preferred_element_type=jnp.float32)
+    for (kernel, _), rows, back in zip(weights[::-1], inputs[::-1], [*activations[::-1], None], strict=True):
+        pull = cotangent.astype(rows.dtype)
+        gradients.append((product("...f,...g->fg", rows, pull), jnp.sum(cotangent, axis=range(cotangent.ndim - 1))))
+        cotangent = product("...g,fg->...f", pull, kernel.astype(rows.dtype))
+        cotangent = cotangent if back is None else back(cotangent)[0]
+    return gradients[::-1], cotangent
