@@ -135,6 +135,7 @@ def step_world(env: Env, scenes: Scene, episode: Episode, action: Float[Array, "
     scene = _select(scenes, episode.scene)
     control = lambda state: env.control_step(scene, state, action)  # noqa: E731
     state, _, outcome, _ = environment.repeat_action(control, episode.state, action_repeat=env.action_repeat)
+    state = env.respawn(scene, state)
     result = WorldStep(
         reward=outcome.reward,
         terms=outcome.terms,

@@ -361,7 +361,8 @@ class Env(NamedTuple):
 
     The other functions are their parts: `init_state` and `observe` divide a reset, so that training restarts finished worlds before it
     computes the observation; `control_step` is a single control step. It reads every `action_repeat`-th action of an
-    episode, the first one first, and holds it until the next. `current_scene` gives the scene at the time of a state.
+    episode, the first one first, and holds it until the next; `respawn` ends an action: it starts finished agents again, where
+    `spawning.respawn_clearance_m` asks for it. `current_scene` gives the scene at the time of a state.
 
     All of them take arrays of numpy or JAX, also closed over, and raise ValueError when they are traced with an argument of another shape
     or kind of number than is annotated here. Values are not checked: an agent that starts with a number that is not finite, or with a size
@@ -372,6 +373,7 @@ class Env(NamedTuple):
     step: Callable[[Scene, State, Float[Array, "A 3"]], tuple[State, StepResult]]
     init_state: Callable[..., State]  # (key, scene, control step at which it begins = 0)
     control_step: Callable[[Scene, State, Float[Array, "A 3"]], tuple[State, StepResult]]
+    respawn: Callable[[Scene, State], State]
     observe: Callable[[Scene, State], Observation]
     current_scene: Callable[[Scene, State], Scene]
     action_repeat: int = 1

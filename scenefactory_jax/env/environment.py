@@ -164,7 +164,8 @@ def assemble(parts: EnvParts) -> Env:
 
     The parts of its functions are traced once for arguments of the same shapes, also where several programs have them.
     """
-    start, control, look = (jax.jit(functools.partial(function, parts)) for function in (_init_state, _control_step, _observe))
+    functions = _init_state, _control_step, _respawn, _observe
+    start, control, again, look = (jax.jit(functools.partial(function, parts)) for function in functions)
 
     def reset(key: PRNGKeyArray, scene: Scene) -> tuple[State, Observation]:
         (scene,) = _checked("env.reset", scene)
@@ -179,10 +180,14 @@ def assemble(parts: EnvParts) -> Env:
     def step(scene: Scene, state: State, action: Float[Array, "A 3"]) -> tuple[State, StepResult]:
         scene, state, action = _checked("env.step", scene, state, action)
         state, _, result, _ = repeat_action(lambda now: control(scene, now, action), state, action_repeat=parts.action_repeat)
+        state = again(scene, state)
         return state, replace(result, observation=look(scene, state))
 
     def control_step(scene: Scene, state: State, action: Float[Array, "A 3"]) -> tuple[State, StepResult]:
         return control(*_checked("env.control_step", scene, state, action))
+
+    def respawn(scene: Scene, state: State) -> State:
+        return again(*_checked("env.respawn", scene, state))
 
     def observe(scene: Scene, state: State) -> Observation:
         return look(*_checked("env.observe", scene, state))
@@ -192,7 +197,7 @@ def assemble(parts: EnvParts) -> Env:
 
     given = parts.traffic.past
     past = given and given._replace(bind=lambda *late: assemble(parts._replace(traffic=given.bind(*late))))
-    return Env(reset, step, init_state, control_step, observe, current_scene, parts.action_repeat, past)
+    return Env(reset, step, init_state, control_step, respawn, observe, current_scene, parts.action_repeat, past)
 
 
 def _checked(where: str, scene: Scene, *rest: Any) -> tuple[Any, ...]:
@@ -228,14 +233,15 @@ def repeat_action(
         carry: of `note`: (carry, state before the control step, its result) -> (carry, numbers to add up).
 
     Returns:
-        The state after the action, the carry, the action's result and the sums of the numbers. Rewards and terms are sums and events are
-        those of any control step, for the agents that took the action: an agent that respawns meanwhile has no part in them. Metrics are
-        those of the agent's last control step; `truncated` and `world_done` are the last control step's.
+        The state after the action, in which no agent has started again, the carry, the action's result and the sums of the numbers. Rewards
+        and terms are sums and events are those of any control step, for the agents that were active in it. Metrics are those of the agent's
+        last control step; `truncated` and `world_done` are the last control step's.
     """
 
-    def body(loop: tuple[State, Any, Array], _: None) -> tuple[tuple[State, Any, Array], tuple]:
-        before, carry, acting = loop
+    def body(loop: tuple[State, Any], _: None) -> tuple[tuple[State, Any], tuple]:
+        before, carry = loop
         after, result = control(before)
+        acting = before.active
         agents = {
             "reward": jnp.where(acting, result.reward, 0.0),
             "terms": {name: jnp.where(acting, term, 0.0) for name, term in result.terms.items()},
@@ -244,10 +250,10 @@ def repeat_action(
         }
         carry, numbers = note(carry, before, result)
         world = {"truncated": result.truncated, "world_done": result.world_done}
-        return (after, carry, acting & ~result.terminated), (agents, acting, result.metrics, world, numbers)
+        return (after, carry), (agents, acting, result.metrics, world, numbers)
 
     # unrolled, a single control step is no loop in the program
-    (state, carry, _), steps = jax.lax.scan(body, (state, carry, state.active), None, length=action_repeat, unroll=action_repeat == 1)
+    (state, carry), steps = jax.lax.scan(body, (state, carry), None, length=action_repeat, unroll=action_repeat == 1)
     agents, acted, metrics, world, numbers = steps
     agents, numbers = jax.tree.map(lambda leaf: leaf.any(0) if leaf.dtype == bool else leaf.sum(0), (agents, numbers))
     last = jnp.maximum(acted.sum(0) - 1, 0)[None]
@@ -299,7 +305,6 @@ def _init_state(parts: EnvParts, key: PRNGKeyArray, scene: Scene, step: Int[Arra
 
 def _control_step(parts: EnvParts, scene: Scene, state: State, action: Float[Array, "A 3"]) -> tuple[State, StepResult]:
     """Advances a world by one control step, without the observation."""
-    logged = scene.agents  # of which samplers read the starts
     scene = _scene_at(parts, scene, replace(state, weather=rain.advance_rain(state.weather, dt=parts.control_dt)))
     action = jnp.where(state.active[:, None], _hold_action(parts, state, action), 0.0)
     after = _advance(parts, scene, state, action)
@@ -310,11 +315,7 @@ def _control_step(parts: EnvParts, scene: Scene, state: State, action: Float[Arr
     after = replace(after, active=state.active & ~terminated, past_events=past_events)
     reward, terms = rewards.sum_terms(RewardInput(scene, state, after.previous_action, after, metrics, events), parts.terms)
     truncated = after.step >= parts.episode_steps
-    if parts.respawn_clearance_m is None:
-        world_done = truncated | ~jnp.any(after.active)
-    else:
-        world_done = truncated
-        after = _respawn(parts, replace(scene, agents=logged), after, clear_m=parts.respawn_clearance_m)
+    world_done = truncated | ~jnp.any(after.active) if parts.respawn_clearance_m is None else truncated
     return to_strong_type(after), StepResult(None, reward, terms, events, terminated, truncated, world_done, metrics)
 
 
@@ -359,17 +360,16 @@ def _restore_non_finite(metrics: StepMetrics, before: State, after: State) -> tu
     return clean, replace(after, body=body, motion=motion, previous_action=action)
 
 
-def _respawn(parts: EnvParts, scene: Scene, state: State, *, clear_m: float) -> State:
-    """Starts finished agents again at a new sample where there is room; the others stay inactive.
-
-    Args:
-        scene: at the time of the state, but with the logged agents, which samplers read.
-    """
+def _respawn(parts: EnvParts, scene: Scene, state: State) -> State:
+    """Starts finished agents again at a new sample where there is room; the others stay inactive. Without a clearance none starts."""
+    if parts.respawn_clearance_m is None:
+        return state
     sample_key, key, body_key = jax.random.split(state.key, 3)
+    scene = replace(_scene_at(parts, scene, state), agents=scene.agents)  # samplers read the starts of the logged agents
     new = spawning.admit_cars(parts.sample_agents(sample_key, scene))
     body = parts.dynamics.init(body_key, replace(scene, agents=new))
     waiting = ~state.active & new.present & is_finite(parts.dynamics.read(body))
-    clear = spawning.is_clear(new, state.motion.position[:, :2], state.active, scene.traffic, clear_m=clear_m)
+    clear = spawning.is_clear(new, state.motion.position[:, :2], state.active, scene.traffic, clear_m=parts.respawn_clearance_m)
     weights = rewards.draw_weights(jax.random.fold_in(body_key, WEIGHTS), parts.terms, len(waiting))
     weights = tree_where(waiting & clear, weights, state.reward_weights)
     return start_agents(parts, replace(state, key=key, reward_weights=weights), new, body, waiting & clear)

@@ -70,7 +70,8 @@ def rollout(
             carry, output = hook(rollout.carry, ControlStep(scene, before, after, result))
             return RolloutState(after, rollout.world_done | result.world_done, carry), output
 
-        return jax.lax.scan(control_step, rollout, None, length=repeat, unroll=repeat == 1)
+        rollout, outputs = jax.lax.scan(control_step, rollout, None, length=repeat, unroll=repeat == 1)
+        return replace(rollout, state=env.respawn(scene, rollout.state)), outputs
 
     end, outputs = jax.lax.scan(take_action, start, jax.random.split(key, -(-steps // repeat)))
     return end, jax.tree.map(lambda leaf: leaf.reshape(leaf.shape[0] * leaf.shape[1], *leaf.shape[2:])[:steps], outputs)

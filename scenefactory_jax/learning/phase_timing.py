@@ -72,6 +72,7 @@ def make_acting_phase(level: str, parts: EnvParts, env: Env, *, steps: int) -> R
 
         after, (done, total) = jax.lax.scan(control, worlds, None, length=env.action_repeat, unroll=env.action_repeat == 1)
         total = total.sum()
+        after = jax.vmap(env.respawn)(scenes, after) if depth else after
         if depth > 1:
             after = tree_where(done[-1], jax.vmap(env.init_state)(jax.random.split(start_key, len(worlds.step)), scenes), after)
         if depth > 2:

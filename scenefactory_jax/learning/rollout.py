@@ -172,6 +172,7 @@ def step_worlds(
     after, stats, result, counts = environment.repeat_action(
         control, before, worlds.episode_stats, action_repeat=env.action_repeat, note=_count_step
     )
+    after = jax.vmap(env.respawn)(scenes, after)
     truncated = environment.find_truncated_agents(result, before.active)
     outcome = Outcome(reward=result.reward, active=before.active, terminated=result.terminated, truncated=truncated)
     fresh = jax.vmap(env.init_state)(sharding.world_keys(key, len(result.world_done), axis), scenes)

@@ -264,15 +264,14 @@ def test_a_step_is_an_action_with_all_its_control_steps(config):
     jax.tree.map(np.testing.assert_array_equal, outcome.observation, env.observe(scene, state))
 
 
-def test_a_life_that_begins_within_an_action_has_no_part_in_it(config):
-    """The action takes the car to its goal in the first of two control steps, 10.5 / 30 m on. In the second a new life goes on at 10 m/s
-    with free pedals, and what that earns is no part of what the action is paid."""
+def test_a_car_that_ends_within_an_action_starts_again_at_its_end(config):
+    """The action takes the car to its goal in the first of two control steps, 10.5 / 30 m on; it stays there in the second."""
     env = build_env(config, hold=2, respawn=10.0)
     scene = scene_of([[0.0, 0.0]], [[3.345, 0.0]], speeds=[10.0])
     state, _ = env.reset(jax.random.key(0), scene)
     after, outcome = jitted(env.step)(scene, state, jnp.array([[0.5, 0.0, 0.0]]))
     assert outcome.terminated.tolist() == outcome.events.goal_reached.tolist() == after.active.tolist() == [True]
-    assert after.steps_since_spawn.tolist() == [1]
+    assert after.steps_since_spawn.tolist() == [0] and not after.motion.position[0, :2].any()
     assert float(outcome.terms["goal"][0]) == 45.0 and float(outcome.terms["progress"][0]) == pytest.approx(2 * 10.5 / 30, abs=1e-5)
     assert not after.previous_action.any() and float(after.motion.velocity[0, 0]) == 10.0
 

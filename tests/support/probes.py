@@ -224,4 +224,4 @@ def probe(*, life: int | None = None, episode_steps: int = 1000) -> Env:
         state, outcome = control_step(scene, state, action)
         return state, dataclasses.replace(outcome, observation=observe(scene, state))
 
-    return Env(reset, step, init_state, control_step, observe, lambda scene, state: scene)
+    return Env(reset, step, init_state, control_step, lambda scene, state: state, observe, lambda scene, state: scene)

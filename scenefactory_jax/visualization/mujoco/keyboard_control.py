@@ -126,6 +126,7 @@ def make_world(env: Env, scene: Scene, act: Act, parameters: Any, *, car: int, d
     ) -> tuple[State, Observation, StepRecord, Float[Array, ""]]:
         actions = act(parameters, observation, key).at[car].set(action)
         after, outcome = env.control_step(scene, state, actions)
+        after = env.respawn(scene, after)
         squared = queries.squared_segment_distance(after.motion.position[car, None, :2], scene.road, half_width_m=0.0)
         distance = jnp.sqrt(jnp.min(squared, where=scene.road.valid, initial=jnp.inf))
         return after, env.observe(scene, after), make_step_record(env, scene, state, after, outcome), distance
