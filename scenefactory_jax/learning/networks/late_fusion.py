@@ -21,7 +21,7 @@ from typing import Any, Literal
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, PRNGKeyArray
+from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from scenefactory_jax.core.pallas import on_gpu
 from scenefactory_jax.core.schema import ConfigError, Count
@@ -226,14 +226,25 @@ def pool(x: Float[Array, "*batch K F"], mask: Bool[Array, "*batch K"]) -> Float[
     return jnp.where(jnp.any(mask, axis=-1)[..., None], largest, 0.0)
 
 
+def find_winners(x: Float[Array, "*batch K F"], mask: Bool[Array, "*batch K"]) -> tuple[Float[Array, "*batch F"], Int[Array, "*batch F"]]:
+    """Computes each channel's maximum over the rows of the mask, and the first row with it, in one pass; zeros for an empty set."""
+
+    def larger(one: tuple[Array, Array], other: tuple[Array, Array]) -> tuple[Array, Array]:
+        first = (one[0] > other[0]) | jnp.isnan(one[0]) | ((one[0] == other[0]) & (one[1] < other[1]))
+        return jnp.where(first, one[0], other[0]), jnp.where(first, one[1], other[1])
+
+    row = jax.lax.broadcasted_iota(jnp.int32, x.shape, x.ndim - 2)
+    columns, nothing = (jnp.where(mask[..., None], x, -jnp.inf), row), (jnp.float32(-jnp.inf), jnp.int32(x.shape[-2]))
+    value, winner = jax.lax.reduce(columns, nothing, larger, (x.ndim - 2,))
+    shown = jnp.any(mask, axis=-1)[..., None]
+    return jnp.where(shown, value, 0.0), jnp.where(shown, winner, 0)
+
+
 def _winners(activation: str, dtype: str, kernels: bool, weights: list, x: Array, mask: Array) -> tuple[Array, Array]:
     """Computes the pooled channels and the row that each is from."""
 
     def plain(weights: list, x: Array, mask: Array) -> tuple[Array, Array]:
-        rows = affine(activation, dtype, weights, x)
-        if not mask.shape[-1]:
-            return pool(rows, mask), jnp.zeros((*mask.shape[:-1], rows.shape[-1]), jnp.int32)
-        return pool(rows, mask), jnp.argmax(jnp.where(mask[..., None], rows, -jnp.inf), axis=-2).astype(jnp.int32)
+        return find_winners(affine(activation, dtype, weights, x), mask)
 
     quick = functools.partial(set_kernel.encode, activation, dtype)
     return _on(kernels and not _has_few_rows(weights, mask) and set_kernel.fits(weights), quick, plain, weights, x, mask)
