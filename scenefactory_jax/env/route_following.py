@@ -154,6 +154,7 @@ def compute_metrics(
 ) -> RouteMetrics:
     """Computes place, progress and offences of a control step along the routes; zeros and false for agents without a route.
 
+    A car drives the wrong way against its route, or, where it does not follow it, against the nearest lane.
     A car offends at a stop line if its front passes the line in this step, on its route, with a red light at the end of the step, or at a
     stop sign without having stood within `stand_distance_m` before the line.
     """
@@ -182,7 +183,8 @@ def compute_metrics(
     }
     values = {name: jnp.where(routed, value, 0.0) for name, value in values.items()}
     values["has_route"] = routed
-    values["wrong_way"] = against_lane | (routed & moving & (alignment < config.wrong_way_cosine))
+    along = (alignment >= config.wrong_way_cosine) & (place.distance <= config.on_lane_m)  # in a junction other ways lie across a car's own
+    values["wrong_way"] = jnp.where(routed, moving & (alignment < config.wrong_way_cosine) | against_lane & ~along, against_lane)
     lines = find_stop_lines(scene, agents, arc, after.step.astype(jnp.float32) * control_dt)
     line_arc = scene.routes.stop_arc[agents.route]
     on_route = routed & (place.distance <= config.off_route_m)

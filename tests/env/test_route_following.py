@@ -145,6 +145,15 @@ def test_against_the_route_is_the_wrong_way(glide):
     assert metrics.wrong_way[-1].tolist() == [False, True] and metrics.route_alignment[-1, 1] < -0.99
 
 
+def test_a_lane_across_the_route_makes_no_wrong_way_on_it(glide):
+    """The scene's lane leads to +x, the routes to -x, as connectors of a junction do; the second car is beside its route, on that lane."""
+    scene = routed_scene([STRAIGHT[::-1], STRAIGHT[::-1] + np.array([0.0, 2.0])], starts=[20.0, 50.0], speeds=[6.0, 6.0])
+    moved = replace(scene, agents=replace(scene.agents, position=scene.agents.position.at[1, 1].set(0.0)))
+    _, metrics = glide(moved, 3)
+    assert (metrics.route_alignment[-1] > 0.99).all()
+    assert metrics.wrong_way[-1].tolist() == [False, True]
+
+
 def test_a_world_without_routes_reads_zeros(glide):
     _, metrics = glide(scene_of([[0.0, 0.0]], [[40.0, 0.0]], speeds=[5.0]), 2)
     for name in ("route_arc", "route_progress", "route_remaining", "route_completion", "route_distance", "overspeed"):
