@@ -1,11 +1,13 @@
-"""Train states on disk: a folder of checkpoints, one npz file for each saved iteration, and its replay buffers in another beside it.
+"""Train states on disk: a folder of checkpoints, one npz file for each saved iteration, with its worlds and replay buffers beside it.
 
-Buffers take gigabytes; without their file a policy is still evaluated and started from, but training does not go on. A file has the
-arrays of a train state by their paths ("parameters/params/actor/trunk/layer_0/kernel"), random keys as their data, and no empty arrays.
-It is written atomically. The checksums of its arrays (CRC-32, as in every zip file) are compared before anything is read.
+A policy needs neither to be evaluated or started from. Buffers take gigabytes; without their file training does not go on. Worlds take
+hundreds of megabytes; without their file training goes on in new episodes, so that a run moves to another machine as a small file. A file
+has the arrays of a train state by their paths ("parameters/params/actor/trunk/layer_0/kernel"), random keys as their data, and no empty
+arrays. It is written atomically. The checksums of its arrays (CRC-32, as in every zip file) are compared before anything is read.
 """
 
 import json
+import logging
 import zipfile
 from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
@@ -26,9 +28,11 @@ from scenefactory_jax.learning.replay_buffer import Buffer
 PARAMETERS, AVERAGED, LEARNT, BUFFER = "parameters/", "ema_parameters/", "learner/", "buffer/"  # paths of arrays begin with these
 NETWORKS = (PARAMETERS, AVERAGED, LEARNT)  # what a finished run is left with
 NETWORK = "/params/"  # behind the path of a network
+PARTS = {"buffer": (BUFFER,), "worlds": ("worlds/", "scene_stats/")}  # in files of their own: N.buffer.npz, N.worlds.npz
 HOST = "host"  # JSON text of the values that the training loop adds
 FILE = "policy.npz"  # in place of checkpoints: parameters alone
 Arrays = dict[str, np.ndarray]
+LOG = logging.getLogger(__name__)
 
 
 def save(folder: Path | str, train_state: Any, *, keep: int, host: Mapping[str, Any] | None = None) -> Path:
@@ -53,8 +57,9 @@ def save(folder: Path | str, train_state: Any, *, keep: int, host: Mapping[str, 
     arrays |= {} if host is None else {HOST: np.array(json.dumps(host))}
     file.parent.mkdir(parents=True, exist_ok=True)
     try:
-        if buffers := {name: arrays.pop(name) for name in list(arrays) if name.startswith(BUFFER)}:
-            _write(_buffer_path(file), buffers)  # first: a checkpoint without its buffers would be the newest
+        for part, prefixes in PARTS.items():  # first: a checkpoint without its buffers would be the newest
+            if arrays_of_part := {name: arrays.pop(name) for name in list(arrays) if name.startswith(prefixes)}:
+                _write(_beside(file, part), arrays_of_part)
         _write(file, arrays)
     except OSError as error:
         hint, newest = "there is no complete checkpoint", latest(folder)
@@ -76,13 +81,15 @@ def drop_training_state(folder: Path | str) -> None:
     *earlier, newest = _list_iterations(folder)
     _write(_path(folder, newest), _load(_path(folder, newest), NETWORKS))
     _remove(folder, earlier)
-    _buffer_path(_path(folder, newest)).unlink(missing_ok=True)
+    for part in PARTS:
+        _beside(_path(folder, newest), part).unlink(missing_ok=True)
 
 
 def restore(folder: Path | str, like: Any, iteration: int | None = None) -> Any:
     """Reads the train state of an iteration (the newest by default), in the structure and on the devices of `like`.
 
-    Replay buffers may have other groups, of another number of devices: their rows are dealt anew.
+    Replay buffers may have other groups, of another number of devices: their rows are dealt anew. Without a file
+    of worlds those of `like` are taken.
 
     Args:
         like: a train state of the same config, for example a new `trainer.init(...)`.
@@ -95,23 +102,28 @@ def restore(folder: Path | str, like: Any, iteration: int | None = None) -> Any:
     stored = {name: value for name, value in _load(file).items() if name != HOST}
     if all(name.startswith(NETWORKS) for name in stored):
         raise ConfigError(f"{file}: has networks only; training cannot go on, only start_from this run")
-    leaves = name_leaves(like)
-    stored |= _load_buffers(file, like, missing=not any(name.startswith(BUFFER) for name in stored))
+    leaves, held = name_leaves(like), {}
+    for part, prefixes in PARTS.items():
+        wanted = {name: leaf for name, leaf in leaves.items() if name.startswith(prefixes) and leaf.size}
+        if _beside(file, part).is_file():
+            stored |= _load_part(_beside(file, part))
+        elif wanted and not any(name.startswith(prefixes) for name in stored):  # older checkpoints have all in one file
+            if part != "worlds":
+                missing = f"{_beside(file, part).name} is not beside it, the replay buffer"
+                raise ConfigError(f"{file}: {missing}; training cannot go on, only start_from this run")
+            LOG.info(f"{file}: {_beside(file, part).name} is not beside it: all worlds start new episodes")
+            held = wanted
     stored |= _regroup_buffers(stored, like)
-    _check_same_arrays(stored, {name: _to_data(leaf) for name, leaf in leaves.items() if leaf.size}, file)
-    return jax.tree.unflatten(jax.tree.structure(like), [_place(stored.get(name), leaf) for name, leaf in leaves.items()])
+    expected = {name: _to_data(leaf) for name, leaf in leaves.items() if leaf.size and name not in held}
+    _check_same_arrays(stored, expected, file)
+    return jax.tree.unflatten(jax.tree.structure(like), [held.get(name, _place(stored.get(name), leaf)) for name, leaf in leaves.items()])
 
 
-def _load_buffers(file: Path, like: Any, *, missing: bool) -> Arrays:
-    """The replay buffers of a checkpoint; `missing`: it has none itself, as those that were made before buffers had their own file."""
-    buffers = _buffer_path(file)
-    if buffers.is_file():
-        if damage := _find_damage(buffers):
-            raise ConfigError(f"{buffers}: damaged: {damage}; restore it from a copy, or start_from this run")
-        return _load(buffers)
-    if missing and jax.tree.leaves(like.buffer):
-        raise ConfigError(f"{file}: {buffers.name} is not beside it, the replay buffer; training cannot go on, only start_from this run")
-    return {}
+def _load_part(file: Path) -> Arrays:
+    """The arrays of a file beside a checkpoint."""
+    if damage := _find_damage(file):
+        raise ConfigError(f"{file}: damaged: {damage}; restore it from a copy, or start_from this run")
+    return _load(file)
 
 
 def _regroup_buffers(stored: Arrays, like: Any) -> Arrays:
@@ -193,18 +205,19 @@ def _path(folder: Path | str, iteration: int) -> Path:
     return Path(folder) / f"{iteration}.npz"
 
 
-def _buffer_path(file: Path) -> Path:
-    """The file of a checkpoint's replay buffers."""
-    return file.with_suffix(".buffer.npz")
+def _beside(file: Path, part: str) -> Path:
+    """The file of a part of a checkpoint."""
+    return file.with_suffix(f".{part}.npz")
 
 
 def _remove(folder: Path | str, iterations: Iterable[int]) -> None:
-    """Removes checkpoints, and buffers without one: a save may have ended between the two files."""
+    """Removes checkpoints, and parts without one: a save may have ended between the files."""
     for iteration in iterations:
         _path(folder, iteration).unlink()
-    kept = {_buffer_path(_path(folder, iteration)) for iteration in _list_iterations(folder)}
-    for file in set(Path(folder).glob("*.buffer.npz")) - kept:
-        file.unlink()
+    for part in PARTS:
+        kept = {_beside(_path(folder, iteration), part) for iteration in _list_iterations(folder)}
+        for file in set(Path(folder).glob(f"*.{part}.npz")) - kept:
+            file.unlink()
 
 
 def _list_iterations(folder: Path | str) -> list[int]:

@@ -60,7 +60,8 @@ def saved(trainer, tmp_path_factory):
 
 def test_the_newest_are_kept(saved):
     folder, third, _ = saved
-    assert checkpoint.latest(folder) == 3 and sorted(path.name for path in folder.iterdir()) == ["2.npz", "3.npz"]
+    names = [f"{iteration}{part}.npz" for iteration in (2, 3) for part in ("", ".worlds")]
+    assert checkpoint.latest(folder) == 3 and sorted(path.name for path in folder.iterdir()) == names
     checkpoint.save(folder, third, keep=2)  # again, under the same number
     assert checkpoint.latest(folder) == 3
 
@@ -266,7 +267,7 @@ def test_replay_buffers_have_their_own_file(saved, tmp_path):
         full = dataclasses.replace(state, buffer={"sac": {"rows": start + jnp.arange(4.0)}})
         (tmp_path / "2.buffer.npz").write_bytes(b"")  # of a save that ended before its checkpoint
         checkpoint.save(tmp_path, full, keep=1)
-    assert sorted(file.name for file in tmp_path.iterdir()) == ["4.buffer.npz", "4.npz"]
+    assert sorted(file.name for file in tmp_path.iterdir()) == ["4.buffer.npz", "4.npz", "4.worlds.npz"]
     assert_same(checkpoint.restore(tmp_path, full), full)
     put(tmp_path / "4.buffer.npz", (tmp_path / "4.buffer.npz").read_bytes().replace(np.float32(1.0).tobytes(), np.float32(7.0).tobytes()))
     with pytest.raises(ConfigError, match=r"buffer\.npz: damaged: buffer/sac/rows has changed"):
@@ -275,6 +276,19 @@ def test_replay_buffers_have_their_own_file(saved, tmp_path):
     assert_same(checkpoint.restore_parameters(tmp_path), full.ema_parameters)
     with pytest.raises(ConfigError, match=r"4\.npz: 4\.buffer\.npz is not beside it, the replay buffer; training cannot go on"):
         checkpoint.restore(tmp_path, full)
+
+
+def test_without_its_worlds_a_run_goes_on_in_new_episodes(saved, trainer, tmp_path, caplog):
+    folder, new = shutil.copytree(saved[0], tmp_path / "run"), begin(trainer)
+    worlds = (folder / "3.worlds.npz").read_bytes()
+    (folder / "3.worlds.npz").unlink()
+    caplog.set_level("INFO")
+    found = checkpoint.restore(folder, new)
+    assert "3.worlds.npz is not beside it: all worlds start new episodes" in caplog.text
+    assert_same(found, dataclasses.replace(saved[1], worlds=new.worlds, scene_stats=new.scene_stats))
+    put(folder / "3.worlds.npz", worlds[:-200])
+    with pytest.raises(ConfigError, match=r"3\.worlds\.npz: damaged"):
+        checkpoint.restore(folder, new)
 
 
 def test_a_new_training_starts_from_the_networks_of_another(trainer, saved):
