@@ -1,7 +1,7 @@
 """States of traffic lights over time."""
 
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Float, Int, Shaped
 
 from scenefactory_jax.core.types import GREEN_STATES, LIGHT_STATES, RED_STATES, YELLOW_STATES, TrafficControls
 
@@ -17,13 +17,33 @@ def read_light_states(controls: TrafficControls, time_s: Float[Array, ""]) -> In
 
     A light is unknown before its first change.
     """
-    periodic = jnp.isfinite(controls.period_s)
-    period = jnp.where(periodic, controls.period_s, 1.0)
-    time = jnp.where(periodic, jnp.mod(time_s, period), time_s)
-    place = jnp.sum(controls.change_s <= time[:, None], axis=1) - 1
-    last = max(controls.change_s.shape[1] - 1, 0)
-    state = jnp.take_along_axis(controls.state, jnp.clip(place, 0, last)[:, None], axis=1)[:, 0] if controls.state.size else place
+    place, _ = _find_change(controls, time_s)
+    state = _take(controls.state, place) if controls.state.size else place
     return jnp.where((place >= 0) & controls.valid & ~controls.stop_sign, state, 0).astype(jnp.int32)
+
+
+def read_light_ages(controls: TrafficControls, time_s: Float[Array, ""]) -> Float[Array, " C"]:
+    """Seconds since every light got its state; inf where it is unknown. At least those since the table begins."""
+    if not controls.state.size:
+        return jnp.full(controls.valid.shape, jnp.inf)
+    place, time = _find_change(controls, time_s)
+    age = time - _take(controls.change_s, place)
+    last = jnp.sum(jnp.isfinite(controls.change_s), axis=1) - 1
+    goes_on = jnp.isfinite(controls.period_s) & (place == 0) & (last > 0) & (_take(controls.state, last) == controls.state[:, 0])
+    age = jnp.where(goes_on, time + controls.period_s - _take(controls.change_s, last), age)  # it began in the period before
+    return jnp.where((place >= 0) & controls.valid & ~controls.stop_sign, age, jnp.inf)
+
+
+def _find_change(controls: TrafficControls, time_s: Float[Array, ""]) -> tuple[Int[Array, " C"], Float[Array, " C"]]:
+    """The last change of every light, -1 before the first, and the time, in its period where it has one."""
+    periodic = jnp.isfinite(controls.period_s)
+    time = jnp.where(periodic, jnp.mod(time_s, jnp.where(periodic, controls.period_s, 1.0)), time_s)
+    return jnp.sum(controls.change_s <= time[:, None], axis=1) - 1, time
+
+
+def _take(table: Shaped[Array, "C N"], place: Int[Array, " C"]) -> Shaped[Array, " C"]:
+    """One entry of each row, the nearest one where there is none."""
+    return jnp.take_along_axis(table, jnp.clip(place, 0, table.shape[1] - 1)[:, None], axis=1)[:, 0]
 
 
 def find_red(states: Int[Array, " C"]) -> Bool[Array, " C"]:

@@ -135,6 +135,12 @@ def test_lights_follow_their_changes_and_periods():
     states = [read(controls, np.float32(time)).tolist() for time in (0.5, 2.5, 5.5, 6.5, 8.5, 61.0)]
     assert states == [[STOP, GO, 0], [GO, GO, 0], [CAUTION, 0, 0], [STOP, 0, 0], [GO, 0, 0], [STOP, 0, 0]]
     assert read(controls, np.float32(-2.0)).tolist()[1] == 0, "unknown before the first change"
+    age = jax.jit(traffic_lights.read_light_ages)
+    ages = [age(controls, np.float32(time)).tolist() for time in (0.5, 2.5, 8.5, 61.0)]
+    np.testing.assert_allclose(ages, [[0.5, 1.5, np.inf], [0.5, 3.5, np.inf], [0.5, 5.5, np.inf], [1.0, 58.0, np.inf]], atol=1e-4)
+    assert age(controls, np.float32(-2.0))[1] == np.inf
+    whole = controls_of(((0.0, 0.0), [(0.0, CAUTION), (2.0, STOP), (5.0, CAUTION)], 6.0))  # yellow goes on where the period ends
+    np.testing.assert_allclose([age(whole, np.float32(time))[0] for time in (5.5, 7.0, 8.5)], [0.5, 2.0, 0.5], atol=1e-5)
     assert traffic_lights.find_red(jnp.array([STOP, GO, CAUTION, 1, 7])).tolist() == [True, False, False, True, True]
 
 

@@ -18,7 +18,8 @@ ENTRIES = load_config("train", "observations=drive")["observations"]
 NEAREST = {"_target_": "nearest_controls", "count": 3, "radius_m": 50.0, "distance_scale_m": 20.0}
 BEYOND = {name: {**ENTRIES[kind], "beyond_goal": True} for name, kind in {"far_route": "route", "far_goal": "ego"}.items()}
 NAMED = {name: ENTRIES[name] for name in ("route", "lights", "signs", "ego")}
-GROUPS = observations.make(NAMED | BEYOND | {"nearest": NEAREST}, control_dt=DT)
+AGED = {"aged_lights": {**ENTRIES["lights"], "age_scale_s": 3.0}}
+GROUPS = observations.make(NAMED | BEYOND | AGED | {"nearest": NEAREST}, control_dt=DT)
 AHEAD = ENTRIES["route"]["ahead_m"]
 
 
@@ -121,6 +122,14 @@ def test_lights_and_signs_ahead_of_the_front_come_in_the_order_of_the_route():
     passed = jax.device_get(observe(arc=18.5, place=(18.5, 0.0)))  # the front is half a metre behind the first line
     np.testing.assert_allclose(passed["lights"].features[0, 0, 3:], [0, 0, 1, 0])
     assert passed["lights"].mask.tolist()[0] == [True, False]
+
+
+def test_a_light_shows_how_long_it_has_had_its_colour():
+    """The first light is red for a second and yellow for a second, in turn; the second is green from the start."""
+    for time, first in ((0.5, 0.5), (1.5, 0.5), (2.9, 0.9)):
+        seen = jax.device_get(observe(step=round(time / DT)))
+        np.testing.assert_array_equal(seen["aged_lights"].features[0, :, :-1], seen["lights"].features[0])
+        np.testing.assert_allclose(seen["aged_lights"].features[0, :, -1], [first / (3 + first), time / (3 + time)], rtol=1e-4)
 
 
 def test_the_nearest_controls_are_seen_without_a_route():

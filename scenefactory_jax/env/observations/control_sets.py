@@ -14,18 +14,33 @@ from scenefactory_jax.roadgraph import traffic_lights
 
 
 @bound_observation(FRACTION, SIGNED, SIGNED, FRACTION)
-def lights(scene: Scene, state: State, *, count: Count, distance_scale_m: Positive, control_dt: float) -> SetObservation:
+def lights(
+    scene: Scene, state: State, *, count: Count, distance_scale_m: Positive, control_dt: float, age_scale_s: Positive | None = None
+) -> SetObservation:
     """The next traffic lights on the agent's own route, the first one first.
 
     Columns: distance of the stop line along the route from the car's front; its x, y in the car's frame; red, yellow, green, unknown as
-    one-hot. Lengths read l / (scale + |l|). A light leaves the set when the front passes its line. Empty for an agent without a route.
+    one-hot; with `age_scale_s` the time t since it has had that colour: whether a yellow light has just begun decides whether to brake.
+    Lengths read l / (scale + |l|), times the same, and 1 where unknown. A light leaves the set when the front passes its line. Empty for an
+    agent without a route.
     """
     time_s = state.step.astype(jnp.float32) * control_dt
     lines = route_following.find_stop_lines(scene, state.agents, state.route.arc, time_s)
     rows = _choose_next(scene, state, lines, ~lines.stop_sign, count)
     shown = jnp.take_along_axis(lines.state, rows.slot, axis=1)
     columns = [*_place(scene, state, rows, distance_scale_m), traffic_lights.encode_colour(shown)]
+    if age_scale_s is not None:
+        columns.append(_read_ages(scene, rows, time_s, age_scale_s)[..., None])
     return pad_rows(jnp.concatenate(columns, axis=-1), rows.mask, count)
+
+
+def _read_ages(scene: Scene, rows: "_Rows", time_s: Float[Array, ""], scale: float) -> Float[Array, "A N"]:
+    """How long the lights of rows have had their colours."""
+    if scene.controls.valid.shape[0] == 0:
+        return jnp.ones(rows.mask.shape, jnp.float32)
+    age = traffic_lights.read_light_ages(scene.controls, time_s)[rows.control]
+    known = jnp.isfinite(age)
+    return jnp.where(known, compress_length(jnp.where(known, age, 0.0), scale), 1.0)
 
 
 @bound_observation(FRACTION, SIGNED, SIGNED, FRACTION)
