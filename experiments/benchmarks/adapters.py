@@ -115,6 +115,7 @@ def _own(config: Mapping[str, Any], scenes: scene_source.Scenes, actions: np.nda
         states, given, key = carry
         start_key, key = jax.random.split(key)
         after, outcome = jax.vmap(env.control_step)(held, states, given)
+        after = jax.vmap(env.respawn)(held, after)
         fresh = jax.vmap(env.init_state)(jax.random.split(start_key, len(given)), held)
         states = tree_where(outcome.world_done, fresh, after)
         return (states, given, key), (

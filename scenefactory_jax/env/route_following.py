@@ -183,8 +183,9 @@ def compute_metrics(
     }
     values = {name: jnp.where(routed, value, 0.0) for name, value in values.items()}
     values["has_route"] = routed
-    along = (alignment >= config.wrong_way_cosine) & (place.distance <= config.on_lane_m)  # in a junction other ways lie across a car's own
-    values["wrong_way"] = jnp.where(routed, moving & (alignment < config.wrong_way_cosine) | against_lane & ~along, against_lane)
+    against_route = routed & (alignment < config.wrong_way_cosine)
+    follows = routed & ~against_route & (place.distance <= config.on_lane_m)  # in a junction other ways lie across a car's own
+    values["wrong_way"] = (moving & against_route) | (against_lane & ~follows)
     lines = find_stop_lines(scene, agents, arc, after.step.astype(jnp.float32) * control_dt)
     line_arc = scene.routes.stop_arc[agents.route]
     on_route = routed & (place.distance <= config.off_route_m)

@@ -116,7 +116,8 @@ def restore(folder: Path | str, like: Any, iteration: int | None = None) -> Any:
     stored |= _regroup_buffers(stored, like)
     expected = {name: _to_data(leaf) for name, leaf in leaves.items() if leaf.size and name not in held}
     _check_same_arrays(stored, expected, file)
-    return jax.tree.unflatten(jax.tree.structure(like), [held.get(name, _place(stored.get(name), leaf)) for name, leaf in leaves.items()])
+    placed = [leaf if name in held else _place(stored.get(name), leaf) for name, leaf in leaves.items()]
+    return jax.tree.unflatten(jax.tree.structure(like), placed)
 
 
 def _load_part(file: Path) -> Arrays:

@@ -71,7 +71,7 @@ def make_disturbance(noise: Noise, config: Mapping[str, Any]) -> Disturb | None:
 
     Normal numbers are drawn for every `time_s` and joined by arcs of a circle, so that the deviation is the same at all times. They depend
     on the key of the world's episode and on its time alone; where agents start again (`spawning.respawn_clearance_m`) that key is new, and
-    so is the noise, at every step.
+    so is the noise, at every action.
     """
     if not noise.part * max(noise.std):
         return None

@@ -19,7 +19,7 @@ def read_light_states(controls: TrafficControls, time_s: Float[Array, ""]) -> In
     """
     place, _ = _find_change(controls, time_s)
     state = _take(controls.state, place) if controls.state.size else place
-    return jnp.where((place >= 0) & controls.valid & ~controls.stop_sign, state, 0).astype(jnp.int32)
+    return jnp.where(place >= 0, state, 0).astype(jnp.int32)
 
 
 def read_light_ages(controls: TrafficControls, time_s: Float[Array, ""]) -> Float[Array, " C"]:
@@ -31,14 +31,15 @@ def read_light_ages(controls: TrafficControls, time_s: Float[Array, ""]) -> Floa
     last = jnp.sum(jnp.isfinite(controls.change_s), axis=1) - 1
     goes_on = jnp.isfinite(controls.period_s) & (place == 0) & (last > 0) & (_take(controls.state, last) == controls.state[:, 0])
     age = jnp.where(goes_on, time + controls.period_s - _take(controls.change_s, last), age)  # it began in the period before
-    return jnp.where((place >= 0) & controls.valid & ~controls.stop_sign, age, jnp.inf)
+    return jnp.where(place >= 0, age, jnp.inf)
 
 
 def _find_change(controls: TrafficControls, time_s: Float[Array, ""]) -> tuple[Int[Array, " C"], Float[Array, " C"]]:
-    """The last change of every light, -1 before the first, and the time, in its period where it has one."""
+    """The last change of every light, -1 before the first and of what is no light, and the time, in its period where it has one."""
     periodic = jnp.isfinite(controls.period_s)
     time = jnp.where(periodic, jnp.mod(time_s, jnp.where(periodic, controls.period_s, 1.0)), time_s)
-    return jnp.sum(controls.change_s <= time[:, None], axis=1) - 1, time
+    place = jnp.sum(controls.change_s <= time[:, None], axis=1) - 1
+    return jnp.where(controls.valid & ~controls.stop_sign, place, -1), time
 
 
 def _take(table: Shaped[Array, "C N"], place: Int[Array, " C"]) -> Shaped[Array, " C"]:

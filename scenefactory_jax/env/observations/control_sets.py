@@ -34,15 +34,6 @@ def lights(
     return pad_rows(jnp.concatenate(columns, axis=-1), rows.mask, count)
 
 
-def _read_ages(scene: Scene, rows: "_Rows", time_s: Float[Array, ""], scale: float) -> Float[Array, "A N"]:
-    """How long the lights of rows have had their colours."""
-    if scene.controls.valid.shape[0] == 0:
-        return jnp.ones(rows.mask.shape, jnp.float32)
-    age = traffic_lights.read_light_ages(scene.controls, time_s)[rows.control]
-    known = jnp.isfinite(age)
-    return jnp.where(known, compress_length(jnp.where(known, age, 0.0), scale), 1.0)
-
-
 @bound_observation(FRACTION, SIGNED, SIGNED, FRACTION)
 def signs(scene: Scene, state: State, *, count: Count, distance_scale_m: Positive) -> SetObservation:
     """The next stop signs on the agent's own route, the first one first.
@@ -107,6 +98,15 @@ def _place(scene: Scene, state: State, rows: _Rows, scale: float) -> list[Float[
     place = scene.controls.position[rows.control] - state.motion.position[:, None, :2]
     place = to_frame(place, state.motion.yaw[:, None])
     return [compress_length(rows.distance, scale)[..., None], compress_length(place, scale)]
+
+
+def _read_ages(scene: Scene, rows: _Rows, time_s: Float[Array, ""], scale: float) -> Float[Array, "A N"]:
+    """How long the lights of rows have had their colours."""
+    if scene.controls.valid.shape[0] == 0:
+        return jnp.ones(rows.mask.shape, jnp.float32)
+    age = traffic_lights.read_light_ages(scene.controls, time_s)[rows.control]
+    known = jnp.isfinite(age)
+    return jnp.where(known, compress_length(jnp.where(known, age, 0.0), scale), 1.0)
 
 
 def _is_ahead(scene: Scene, state: State, control: Int[Array, "A N"]) -> Bool[Array, "A N"]:

@@ -5,9 +5,9 @@ each set of rows has its own row encoder and is max-pooled over the rows of its 
 vector joins the vector encoder, a set gets an encoder of `rows_default` widths.
 
 Rows are pooled before the last activation, which gives the same since activations increase. A pooled channel depends on one row, its
-winner, so that the gradient recomputes the winners and stores no activation of other rows: exact, in less time and memory. Sets with fewer
-rows than winners recompute all rows. On NVIDIA GPUs encoders of two layers run as one kernel where rows are many (`set_kernel`), which is
-tested against the plain JAX here.
+winner, so that the gradient recomputes the winners and stores no activation of other rows: exact, in less time and memory. Sets with at
+most half as many rows as winners recompute all rows. On NVIDIA GPUs encoders of two layers run as one kernel where rows are many
+(`set_kernel`), which is tested against the plain JAX here.
 
 Differences from the published code, which follow the paper instead: no LayerNorm, no extra 64 to 64 layer before the heads.
 """
