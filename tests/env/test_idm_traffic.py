@@ -394,8 +394,9 @@ def test_trajectory_idm_enters_where_there_is_room_and_walkers_wait():
         {"at": [-8.0, 0.0], "velocity": [9.0, 0.0], "first": 5},
         {"at": [0.0, 48.0], "velocity": [0.0, 1.5], "kind": "pedestrian"},
         {"at": [-10.7, 0.0], "velocity": [9.0, 0.0], "first": 8},  # where the first has been three rows before
+        {"at": [0.5, 50.5], "first": 4, "kind": "pedestrian"},  # who comes from nowhere to stand in the car
     )
-    size = jnp.where(jnp.arange(SLOTS)[:, None] == 1, 0.7, scene.traffic_log.size)
+    size = jnp.where(jnp.isin(jnp.arange(SLOTS), jnp.array([1, 3]))[:, None], 0.7, scene.traffic_log.size)
     scene = replace(scene, traffic_log=replace(scene.traffic_log, yaw=0 * scene.traffic_log.yaw, size=size))
     gone = jax.tree.map(lambda leaf: jnp.concatenate([leaf, leaf]), car_far_away())
     stand = {"position": jnp.array([[0.0, 0.0], [0.0, 50.0]]), "size": jnp.full((2, 2), WIDTH), "present": jnp.ones(2, bool)}
@@ -422,7 +423,9 @@ def test_trajectory_idm_enters_where_there_is_room_and_walkers_wait():
     np.testing.assert_array_equal(blocked.velocity[14, 1], 0.0)
     late = np.count_nonzero(np.diff(walked[:17]) == 0)
     np.testing.assert_allclose(walked[17:30], free.position[17 - late : 30 - late, 1, 1], atol=1e-5)
+    assert [np.argmax(boxes.present[:, 3]) for boxes in (free, blocked)] == [4, 16], "nobody comes to stand where a car is"
     as_logged = drive(scene, jnp.int32(15), reactive="metadrive")
+    assert np.argmax(as_logged.present[:, 3]) == 4
     np.testing.assert_allclose(as_logged.position[14, 1], [0.0, 48.0 + 1.4 * 1.5], atol=1e-5)
 
 

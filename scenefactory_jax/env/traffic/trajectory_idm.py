@@ -14,6 +14,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
+from scenefactory_jax.core import track_interpolation
 from scenefactory_jax.core.geometry import heading_vector, safe_norm, to_frame, wrap_angle
 from scenefactory_jax.core.pytree import replace
 from scenefactory_jax.core.schema import Bounds, Count, NonNegative, Positive
@@ -74,7 +75,7 @@ class TrackState(NamedTuple):
     arc: Float[Array, " O"]  # along the track from that row on
     speed: Float[Array, " O"]
     action: Float[Array, " O"]  # -1: full brake, 1: full throttle
-    waits: Bool[Array, " O"]  # pedestrians and cyclists
+    waits: Bool[Array, " O"]  # of those that do not react
     late: Float[Array, " O"]  # rows for which they have waited
 
 
@@ -107,7 +108,7 @@ def trajectory_idm_traffic(
         selection, clearance: see `reactive`.
         reactive: metadrive: vehicles that move and begin behind the first agent, with its heading; they enter wherever their track begins.
             all: every vehicle that moves; one whose track begins later than the episode enters once there is room. Pedestrians and cyclists
-            follow their log, and wait while a car is in their way.
+            follow their log, and wait while a car is in their way. Nobody comes to stand where a car is.
         kinds, parked_m, gap_s, mass_kg, start_row, elevation_m: as in `log_traffic`.
 
     Raises:
@@ -134,7 +135,7 @@ def trajectory_idm_traffic(
         begun = state.first <= find_row(scene, step + 1)
         if reactive == "metadrive":
             return moved._replace(entered=begun)
-        waits = find_waiting(scene, cars, find_row(scene, step) - state.late, clearance)
+        waits = find_waiting(scene, state.reacts, cars, find_row(scene, step) - state.late, clearance)
         late = state.late + jnp.where(waits, control_dt / scene.log.dt, 0.0)
         enters = find_entering(scene, state, boxes, begun & ~state.entered, clearance)
         return moved._replace(entered=state.entered | enters, waits=waits, late=late)
@@ -262,16 +263,28 @@ def find_entering(scene: Scene, state: TrackState, boxes: Boxes, begun: Bool[Arr
     return begun & ~jnp.any(overlaps(way, ways), axis=1) & ~jnp.any(overlaps(way, way) & earlier, axis=1)
 
 
-def find_waiting(scene: Scene, cars: Boxes, row: Float[Array, " O"], clearance: Clearance) -> Bool[Array, " O"]:
-    """Mask of the pedestrians and cyclists at these rows with a car on the way of their next `reaction_s`; one that is hit goes on."""
-    log, leveled = scene.traffic_log, scene.edges.height is not None
-    nearest = jnp.clip(jnp.round(row).astype(jnp.int32), 0, log.valid.shape[1] - 1)
-    logged = jnp.take_along_axis(log.velocity, nearest[:, None, None], axis=1)[:, 0]
-    users = replace(scene.traffic, velocity=logged)  # also of those that wait
-    way = clearance.margin_m + clearance.reaction_s * safe_norm(users.velocity)
+def find_waiting(scene: Scene, reacts: Bool[Array, " O"], cars: Boxes, row: Float[Array, " O"], clearance: Clearance) -> Bool[Array, " O"]:
+    """Mask of the road users at these rows of their log with a car on the way of their next `reaction_s`: of pedestrians and cyclists on
+    the road, but not of those that are hit, and of all that would come to stand on the road in the next row and do not react."""
+    log, traffic, leveled = scene.traffic_log, scene.traffic, scene.edges.height is not None
+
+    def read(table: Array, at: Int[Array, " O"]) -> Array:
+        return jnp.take_along_axis(table, jnp.clip(at, 0, log.valid.shape[1] - 1).reshape(-1, *[1] * (table.ndim - 1)), axis=1)[:, 0]
+
+    following = jnp.floor(row + track_interpolation.SNAP).astype(jnp.int32) + 1
+    comes = ~traffic.present & read(log.valid, following) & ~reacts
+    logged = read(log.velocity, jnp.where(comes, following, jnp.round(row).astype(jnp.int32)))  # also of those that wait
+    users = replace(
+        traffic,
+        position=jnp.where(comes[:, None], read(log.position, following), traffic.position),
+        yaw=jnp.where(comes, read(log.yaw, following), traffic.yaw),
+        velocity=logged,
+        present=traffic.present | comes,
+    )
+    way = clearance.margin_m + clearance.reaction_s * safe_norm(logged)
     ahead = corridor.find_overlaps(_extend(users, way), cars, leveled=leveled)
-    touching = corridor.find_overlaps(users, cars, leveled=leveled)
-    return (log.kind != VEHICLE) & jnp.any(ahead & ~touching, axis=1)
+    hit = corridor.find_overlaps(users, cars, leveled=leveled) & ~comes[:, None]
+    return (comes | (log.kind != VEHICLE)) & jnp.any(ahead & ~hit, axis=1)
 
 
 def _find_stopping_way(boxes: Boxes, clearance: Clearance) -> Float[Array, " B"]:
