@@ -51,7 +51,7 @@ def make_empty_log(steps: int) -> TrafficLog:
     flat, pair = jnp.zeros((0, steps), jnp.float32), jnp.zeros((0, steps, 2), jnp.float32)
     index = jnp.zeros(0, jnp.int32)
     size, none = jnp.zeros((0, 2), jnp.float32), jnp.zeros(0, bool)
-    return TrafficLog(pair, flat, pair, flat.astype(bool), size, index, index, none, **make_no_zones(0))
+    return TrafficLog(pair, flat, pair, flat.astype(bool), size, index, index, none, none, **make_no_zones(0))
 
 
 def make_no_zones(count: int) -> dict[str, Float[Array, "O O Z"]]:

@@ -93,6 +93,7 @@ class TrafficLog:
     kind: Int[Array, " O"]  # index into ROAD_USERS
     route: Int[Array, " O"]  # row of `Scene.routes`
     has_route: Bool[Array, " O"]
+    leaves: Bool[Array, " O"]  # whether a vehicle's logged way leads through the last place later: who stood there has left it
     # The first stretches where the row's route and the column's are too near for both vehicles, as arc lengths on the row's route
     zone_enter: Float[Array, "O O Z"]  # inf: there is none
     zone_leave: Float[Array, "O O Z"]

@@ -44,6 +44,7 @@ def columns_of(lines, *, traffic=()):
         "traffic_log.valid": np.ones((len(place), 3), bool),
         "traffic_log.size": np.tile([4.0, 2.0], (len(place), 1)),
         "traffic_log.kind": np.zeros(len(place), int),
+        "traffic_log.leaves": np.zeros(len(place), bool),
         **{f"traffic_log.zone_{name}": np.zeros((len(place), len(place), 1)) for name in ("enter", "leave", "match")},
     }
 

@@ -75,7 +75,8 @@ def world(*cars, controls=None, stop_arc=None):
     tracks = TrafficLog(
         **{name: column_of(log[name]) for name in ("position", "yaw", "velocity")}, valid=column_of(log["valid"], bool),
         size=column_of(size), kind=column_of(log["kind"], np.int32), route=column_of(log["route"], np.int32),
-        has_route=column_of(log["has_route"], bool), **{name.split(".")[1]: column_of(zone) for name, zone in zones.items()},
+        has_route=column_of(log["has_route"], bool), leaves=column_of(np.zeros(SLOTS), bool),
+        **{name.split(".")[1]: column_of(zone) for name, zone in zones.items()},
     )  # fmt: skip
     scene = replace(scene_of([[0, 50]], [[5, 50]]), traffic_log=tracks, routes=routes)
     return replace(scene, controls=controls or light([(0.0, "go")]))

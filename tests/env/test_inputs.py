@@ -57,6 +57,7 @@ def street():
         kind=jnp.full((1,), ROAD_USERS.index("vehicle"), jnp.int32),
         route=jnp.zeros(1, jnp.int32),
         has_route=jnp.zeros(1, bool),
+        leaves=jnp.zeros(1, bool),
         **make_no_zones(1),
     )
     return replace(scene, traffic_log=parked)

@@ -127,9 +127,16 @@ def test_static_keeps_the_parked_where_they_stood():
     drives = track([40.0, 0.0], (0.6, 0.0))
     hidden = track([50.0, 0.0], valid=[False] + [True] * 20)
     person = track([60.0, 0.0], kind="pedestrian")
-    scene = with_tracks(scene_of([[0, 0]], [[50, 0]]), track([20.0, 0.5], turn=0.0), creeps, drives, hidden, person)
+    glimpsed = track([70.0, 0.0], (9.0, 0.0), valid=[True] + [False] * 20)  # drives, and is seen once
+    waits = track([80.0, 0.0], valid=[True] * 5 + [False] * 16)  # until its track ends; then somebody drives through
+    scene = with_tracks(scene_of([[0, 0]], [[50, 0]]), track([20.0, 0.5], turn=0.0), creeps, drives, hidden, person, glimpsed, waits)
+    replayed = jax.jit(jax.vmap(lambda step: bound("log_playback")(scene, step).present))(np.arange(100))
+    assert replayed[:, 6].all() and replayed[0, 5] and not replayed[1:, 5].any()
+    scene = replace(scene, traffic_log=replace(scene.traffic_log, leaves=jnp.arange(7) == 6))
+    replayed = jax.jit(jax.vmap(lambda step: bound("log_playback")(scene, step).present))(np.arange(100))
+    assert replayed[:13, 6].all() and not replayed[13:, 6].any()
     first, late = at(scene, "parked", 0), at(scene, "parked", 900)
-    assert first.present.tolist() == [True, True, False, False, False]
+    assert first.present.tolist() == [True, True, False, False, False, False, False]
     for a, b in zip(jax.tree.leaves(first), jax.tree.leaves(late), strict=True):
         np.testing.assert_array_equal(a, b)
     np.testing.assert_array_equal(first.position[:2], [[20.0, 0.5], [30.0, 0.0]])
@@ -305,6 +312,22 @@ def test_everybody_is_kept_or_counted(logged):
     np.testing.assert_allclose(scene.traffic_log.size, [[4.5, 2.0]] * 2)
     assert len(prepared(logged, traffic=0).scene.traffic_log.kind) == 0
     assert packer(traffic=0)(amend(logged, tracks=logged.tracks[:1]))[1].traffic_kept == 0
+
+
+def test_who_stands_where_another_drives_later_has_left(tmp_path):
+    seen = [True] * 11 + [False]
+    objects = [
+        thing(0, id=1, speed=40),
+        thing(30, y=9, id=2, speed=0, valid=seen),  # 0.1 s before the fourth is there
+        thing(30, y=14, id=3, speed=0, valid=seen),
+        thing(-36, y=9, id=4, speed=60),
+        thing(30, y=-9, id=5, speed=0, valid=seen),  # who is the next one: the same car under another number
+        thing(30, y=-9, id=6, speed=0),
+    ]
+    raw = parsed(tmp_path, document(objects=objects), reader_selection.make(load_config("convert", "scenes=womd")["scenes"]["formats"]))
+    scene, report = prepared(raw)
+    assert report.track_ids == (1, 4) and sorted(report.traffic_ids) == [2, 3, 5, 6]
+    assert [i for i, leaves in zip(report.traffic_ids, scene.traffic_log.leaves.tolist(), strict=True) if leaves] == [2]
 
 
 def test_banks_and_stacks_carry_others(tmp_path, logged):

@@ -105,6 +105,7 @@ def scripted(first, goal, second):
         jnp.zeros(1, jnp.int32),
         jnp.zeros(1, jnp.int32),
         jnp.zeros(1, bool),
+        jnp.zeros(1, bool),
         **make_no_zones(1),
     )
     return replace(scene, log=log, traffic_log=box)

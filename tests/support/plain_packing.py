@@ -11,6 +11,7 @@ import numpy as np
 from scenefactory_jax.core.scene_arrays import wrap_angles
 from scenefactory_jax.core.types import ROAD_USERS, STOP_SIGN, Scene
 from scenefactory_jax.data.packing import columns, control_columns, route_columns, route_conflicts
+from scenefactory_jax.data.packing.leaving import SAME_LEVEL_M
 from scenefactory_jax.data.packing.pack import CUTS, DEGENERATE_M, DROPS, TRAFFIC_DROPS, PackReport, _find_centre, overlaps
 from scenefactory_jax.data.packing.validation import DUPLICATE_M, list_ids
 from scenefactory_jax.roadgraph.spatial_grid import SLACK_M
@@ -314,7 +315,21 @@ def _others(raw, agents, leaves, origin, half, first, limit, least):
     rows = _recording(tracks, raw, origin, len(tracks), first)
     rows["size"] = np.maximum(np.array([track.size[:2] for track in tracks], float).reshape(-1, 2), least)
     rows["kind"] = np.array([ROAD_USERS.index(track.kind) for track in tracks], int)
+    cars = [track for track in raw.tracks if track.kind == "vehicle"]
+    left = [track.kind == "vehicle" and any(drives_through(car, track) for car in cars) for track in tracks]
+    rows["leaves"] = np.array(left, bool)
     return {f"traffic_log.{name}": leaf for name, leaf in rows.items()}, chosen, dropped
+
+
+def drives_through(other, track):
+    """Whether a track is within another's last box afterwards, and outside it at some time."""
+    last, later, ever = _last(track), False, False
+    for step in np.flatnonzero(other.valid):
+        x, y, z = other.xyz[step] - track.xyz[last]
+        turn = np.exp(-1j * track.yaw[last]) * (x + 1j * y)
+        within = abs(turn.real) <= track.size[0] / 2 and abs(turn.imag) <= track.size[1] / 2 and abs(z) <= SAME_LEVEL_M
+        later, ever = later or (within and step > last), ever or not within
+    return later and ever
 
 
 def lists(midpoint, valid, origin, *, side, radius_m, size_m):

@@ -25,7 +25,7 @@ def tracks_of(*rows) -> TrafficLog:
     none = np.zeros(len(rows))
     return TrafficLog(
         *map(column_of, (position, yaw, velocity)), column_of(valid, bool), column_of(size), column_of(kind, np.int32),
-        column_of(none, np.int32), column_of(none, bool), **track_interpolation.make_no_zones(len(rows)),
+        column_of(none, np.int32), column_of(none, bool), column_of(none, bool), **track_interpolation.make_no_zones(len(rows)),
     )  # fmt: skip
 
 

@@ -299,6 +299,7 @@ def _add_parked_cars(columns: Mapping[str, np.ndarray], starts: Starts, car_size
         "kind": np.full(count, ROAD_USERS.index("vehicle")),
         "route": np.zeros(count, int),
         "has_route": np.zeros(count, bool),
+        "leaves": np.zeros(count, bool),
     }
     added = {f"traffic_log.{name}": np.concatenate([columns[f"traffic_log.{name}"], leaf]) for name, leaf in rows.items()}
     for name in ("zone_enter", "zone_leave", "zone_match"):

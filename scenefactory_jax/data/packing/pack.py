@@ -20,6 +20,7 @@ from scenefactory_jax.data.packing import columns, control_columns, drawn_starts
 from scenefactory_jax.data.packing.control_columns import ControlsConfig
 from scenefactory_jax.data.packing.drawn_starts import Conflicts, find_conflicts
 from scenefactory_jax.data.packing.elevation_grid import ElevationConfig
+from scenefactory_jax.data.packing.leaving import find_leaving
 from scenefactory_jax.data.packing.route_columns import RouteConfig, RouteCounts
 
 DEGENERATE_M = 1e-6  # shorter segments have no direction
@@ -324,7 +325,9 @@ def _traffic(
     }
     rows = _recording("traffic_log", chosen, logs, first, len(chosen))
     rows["traffic_log.size"] = np.maximum(logs.size[chosen, :2], min_size_m)
-    rows["traffic_log.kind"] = np.array([ROAD_USERS.index(raw.tracks[i].kind) for i in chosen], int)
+    kinds = np.array([ROAD_USERS.index(track.kind) for track in raw.tracks], int)
+    rows["traffic_log.kind"] = kinds[chosen]
+    rows["traffic_log.leaves"] = find_leaving(logs, chosen, kinds == ROAD_USERS.index("vehicle"))
     return rows, chosen, dropped
 
 

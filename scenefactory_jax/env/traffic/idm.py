@@ -112,7 +112,7 @@ def init(scene: Scene, row: Int[Array, ""]) -> IdmState:
     count = log.kind.shape[0]
     rows = jnp.arange(log.valid.shape[1])
     valid = log.valid & (~drives[:, None] | (rows >= row))  # one that stands is on the road from its first row on
-    known, entry = jnp.any(valid, axis=1), jnp.argmax(valid, axis=1)
+    known, entry = jnp.any(valid, axis=1) & (drives | ~log.leaves), jnp.argmax(valid, axis=1)
     read = lambda table: jnp.take_along_axis(table, entry.reshape(-1, *[1] * (table.ndim - 1)), axis=1)[:, 0]  # noqa: E731
     position, yaw, zero = read(log.position), read(log.yaw), jnp.zeros(count, jnp.float32)
     speed = jnp.where(drives, safe_norm(read(log.velocity)), 0.0)

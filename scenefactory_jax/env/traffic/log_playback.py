@@ -34,7 +34,7 @@ def parked_traffic(*, parked_m: NonNegative, start_row: Row, elevation_m: float)
     """Parked vehicles only, as immovable boxes at their logged position.
 
     Args:
-        parked_m: a vehicle whose log stays within this distance of its first position is parked.
+        parked_m: a vehicle whose log stays within this distance of its first position is parked; see `is_parked`.
         start_row: row of the log at which episodes begin; a vehicle that is not valid then is left out.
         elevation_m: of the boxes' centres.
     """
@@ -187,11 +187,13 @@ def is_of_kinds(log: TrafficLog, kinds: list[RoadUser]) -> Bool[Array, " O"]:
 
 
 def is_parked(log: TrafficLog, within_m: float) -> Bool[Array, " O"]:
-    """Mask of vehicles that never leave their first position."""
+    """Mask of vehicles that never leave their first position by `within_m`, nor are ever faster than that in a second: one that is seen for
+    a moment only drives, and one that waits where another drives through after its track's end has driven on."""
     first = jnp.argmax(log.valid, axis=1)
     begin = jnp.take_along_axis(log.position, first[:, None, None], axis=1)
-    moved = jnp.max(jnp.where(log.valid, jnp.sum((log.position - begin) ** 2, axis=-1), 0.0), axis=1, initial=0.0)
-    return (log.kind == VEHICLE) & (moved < within_m**2)
+    squared = jnp.maximum(jnp.sum((log.position - begin) ** 2, axis=-1), jnp.sum(log.velocity**2, axis=-1))
+    moved = jnp.max(jnp.where(log.valid, squared, 0.0), axis=1, initial=0.0)
+    return (log.kind == VEHICLE) & (moved < within_m**2) & ~log.leaves
 
 
 def make_masses(mass_kg: Mapping[RoadUser, float | None]) -> list[float]:
