@@ -39,6 +39,7 @@ class Number(NamedTuple):
     metric: str
     aim: str
     select: Callable[[Records], dict[str, np.ndarray]] = dict  # the records that it is of
+    if_recorded: bool = False  # of these, agents whose recorded driver has no event: some drive over a road edge into a driveway
 
 
 class Row(NamedTuple):
@@ -61,6 +62,12 @@ def select_use(records: Records) -> dict[str, np.ndarray]:
     return select_rows(records, np.isclose(records["friction_use"], 0.8))
 
 
+def select_possible(records: Records, recorded: Records) -> dict[str, np.ndarray]:
+    """The agents whose recorded driver reaches the goal without an event."""
+    name = lambda found: np.char.add(np.char.add(found["scene"].astype(str), " "), found["agent"].astype(str))  # noqa: E731
+    return select_rows(records, np.isin(name(records), name(recorded)[recorded["clean"]]))
+
+
 def _make_grip(mu: float, aim: str) -> Row:
     number = Number(f"`grip`: clean at u = 0.8, mu {mu:g}", "clean_completion_rate", aim, select_use)
     return Row(("protocol=grip", f"protocol.mu={mu:g}"), (), (number,), has_log=False)
@@ -69,11 +76,13 @@ def _make_grip(mu: float, aim: str) -> Row:
 ROWS = {
     "strict": Row(("protocol=strict",), (), (
         Number("`strict`: goal without any event", "clean_success_rate", ">= 98 %"),
+        Number("of agents whose recorded driver does so", "clean_success_rate", "", if_recorded=True),
         Number("the same on bends", "clean_bend_rate", ">= 92 %"),
         Number("events in all (collision, edge, tip-over)", "collision_rate", "<= 0.8 %", count_events),
     )),
     "among": Row(("protocol=strict",), AMONG, (
         Number("`strict` among played-back traffic: clean", "clean_success_rate", ">= 94 %"),
+        Number("of agents whose recorded driver is: clean", "clean_success_rate", "", if_recorded=True),
         Number("the same: collisions", "collision_rate", "<= 3 %"),
     )),
     "paper": Row(("protocol=paper",), (), (Number("from rest (`paper`): collisions", "collision_rate", "<= 1 %"),), has_log=False),
@@ -95,17 +104,26 @@ ROWS = {
 
 
 def measure(row: Row, runs: tuple[str, ...], planner: str | None, scenes: str, given: argparse.Namespace) -> dict[str, Any]:
-    """Measures the numbers of a row: label -> estimate; a number that nothing has is left out."""
-    towns = TOWNS if scenes == "null" else ()
-    overrides = (*row.overrides, *(() if planner else row.of_runs), *towns, *given.overrides)
-    asked = Asked(runs, planner, row.protocol, overrides, None if scenes == "null" else scenes)
-    found, numbers = evaluations.evaluate(asked, given.kept), {}
+    """Measures the numbers of a row: label -> estimate; a number that nothing has is left out, and without recorded drivers what needs
+    them."""
+    found, numbers = _evaluate(row, runs, planner, scenes, given), {}
+    needed = RECORDED in given.planners and any(number.if_recorded for number in row.numbers)
+    recorded = _evaluate(row, (), RECORDED, scenes, given)[0] if needed else None
     for number in row.numbers:
-        chosen = {seed: number.select(records) for seed, records in found.items()}
+        if number.if_recorded and recorded is None:
+            continue
+        possible = {seed: select_possible(records, recorded) if number.if_recorded else records for seed, records in found.items()}
+        chosen = {seed: number.select(records) for seed, records in possible.items()}
         summarise = statistics.summarise_runs if len(chosen) > 1 else lambda runs, **how: statistics.summarise(runs[0], **how)
         if len(chosen[0]["scene"]) and number.metric in (estimates := summarise(chosen, bootstrap=given.bootstrap, seed=0)):
             numbers[number.label] = estimates[number.metric]._asdict() | {"runs": len(chosen)}
     return numbers
+
+
+def _evaluate(row: Row, runs: tuple[str, ...], planner: str | None, scenes: str, given: argparse.Namespace) -> statistics.Runs:
+    towns = TOWNS if scenes == "null" else ()
+    overrides = (*row.overrides, *(() if planner else row.of_runs), *towns, *given.overrides)
+    return evaluations.evaluate(Asked(runs, planner, row.protocol, overrides, None if scenes == "null" else scenes), given.kept)
 
 
 def write_report(result: Mapping[str, Any], path: Path) -> Path:

@@ -130,6 +130,7 @@ def test_the_table_has_what_was_measured_once(tmp_path, monkeypatch):
     assert len(calls) == 3  # no recorded drivers on the drawn routes of the suite grip
     found = result_file.read(tmp_path / "table.json")["sets"]["towns"]
     assert found["ours"]["`strict`: goal without any event"]["value"] == 0.75
+    assert found["ours"]["of agents whose recorded driver does so"]["value"] == 1.0
     assert found["log"]["events in all (collision, edge, tip-over)"]["value"] == 0.1
     assert found["ours"]["`grip`: clean at u = 0.8, mu 0.3"]["value"] == 1.0
     text = (tmp_path / "table.md").read_text()
