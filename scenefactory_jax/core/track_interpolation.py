@@ -1,7 +1,7 @@
 """Interpolates logged tracks at any time."""
 
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Float, Int, Shaped
 
 from scenefactory_jax.core.geometry import wrap_angle
 from scenefactory_jax.core.types import Boxes, TrafficLog
@@ -44,6 +44,11 @@ def interpolate_track(
     yaw_rate = turn / (jnp.maximum(gap, 1.0) * dt)
     at_row = (before >= 0) & (row - before_row < SNAP)  # the last valid row has its logged velocity
     return moved, jnp.where(moving | at_row, speed, 0.0), wrap_angle(yaw[before_row] + fraction * turn), jnp.where(moving, yaw_rate, 0.0)
+
+
+def take_rows(table: Shaped[Array, "O L *n"], row: Int[Array, " O"]) -> Shaped[Array, "O *n"]:
+    """Takes one row of each track's table."""
+    return jnp.take_along_axis(table, row.reshape(-1, *[1] * (table.ndim - 1)), axis=1)[:, 0]
 
 
 def make_empty_log(steps: int) -> TrafficLog:

@@ -237,17 +237,17 @@ def _list_arrivals(columns: Mapping[str, np.ndarray], reaction_s: float, braking
 def _is_run_into(line: Float[np.ndarray, "N 2"], come: _Arrivals, car_size_m: list[float]) -> bool:
     """Whether a road user touches a car at the beginning of a line at a place before which it cannot stop."""
     place, yaw = _point_at(line, 0.0)
-    return bool((_measure_to_box(come.place - place, yaw, np.array(car_size_m)) <= come.half_width).any())
+    return bool((measure_to_box(come.place - place, yaw, np.array(car_size_m)) <= come.half_width).any())
 
 
 def _measure_distances(points: Float[np.ndarray, "N 2"], columns: Mapping[str, np.ndarray], users: np.ndarray) -> Float[np.ndarray, "N K"]:
     """Distances of points from the outlines of road users at the start; 0 inside."""
     row = int(columns["row"])
     offset = points[:, None] - columns["traffic_log.position"][users, row]
-    return _measure_to_box(offset, columns["traffic_log.yaw"][users, row], columns["traffic_log.size"][users])
+    return measure_to_box(offset, columns["traffic_log.yaw"][users, row], columns["traffic_log.size"][users])
 
 
-def _measure_to_box(
+def measure_to_box(
     offset: Float[np.ndarray, "*n 2"], yaw: Float[np.ndarray, "*#n"] | float, size: Float[np.ndarray, "*#n 2"]
 ) -> Float[np.ndarray, "*n"]:
     """Distances of points at offsets from the centres of boxes to their outlines; 0 inside."""

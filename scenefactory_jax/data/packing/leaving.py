@@ -6,6 +6,7 @@ import numpy as np
 from jaxtyping import Bool
 
 from scenefactory_jax.core.scene_arrays import Logs
+from scenefactory_jax.data.packing.drawn_starts import measure_to_box
 
 SAME_LEVEL_M = 3.0  # between the heights of vehicles' centres
 
@@ -20,8 +21,7 @@ def find_leaving(logs: Logs, rows: Sequence[int], vehicles: Bool[np.ndarray, " T
         if not vehicles[row] or not valid[:, last + 1 :].any():
             continue
         apart = logs.xyz[vehicles] - logs.xyz[row, last]
-        cos, sin = np.cos(logs.yaw[row, last]), np.sin(logs.yaw[row, last])
-        along, across = apart[..., 0] * cos + apart[..., 1] * sin, apart[..., 1] * cos - apart[..., 0] * sin
-        within = (abs(along) <= logs.size[row, 0] / 2) & (abs(across) <= logs.size[row, 1] / 2) & (abs(apart[..., 2]) <= SAME_LEVEL_M)
+        within = measure_to_box(apart[..., :2], logs.yaw[row, last], logs.size[row, :2]) == 0
+        within &= np.abs(apart[..., 2]) <= SAME_LEVEL_M
         leaves[place] = ((valid & within)[:, last + 1 :].any(axis=1) & (valid & ~within).any(axis=1)).any()
     return leaves

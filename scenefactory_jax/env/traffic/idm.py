@@ -15,6 +15,7 @@ from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 from scenefactory_jax.core.geometry import dot, heading_vector, safe_norm, to_frame, wrap_angle
 from scenefactory_jax.core.pytree import replace
 from scenefactory_jax.core.schema import NonNegative
+from scenefactory_jax.core.track_interpolation import take_rows
 from scenefactory_jax.core.types import YELLOW_STATES, Boxes, RoadUser, Scene, Traffic, TrafficLog
 from scenefactory_jax.env.traffic import corridor, idm_law, right_of_way
 from scenefactory_jax.env.traffic.corridor import Projection
@@ -113,9 +114,8 @@ def init(scene: Scene, row: Int[Array, ""]) -> IdmState:
     rows = jnp.arange(log.valid.shape[1])
     valid = log.valid & (~drives[:, None] | (rows >= row))  # one that stands is on the road from its first row on
     known, entry = jnp.any(valid, axis=1) & (drives | ~log.leaves), jnp.argmax(valid, axis=1)
-    read = lambda table: jnp.take_along_axis(table, entry.reshape(-1, *[1] * (table.ndim - 1)), axis=1)[:, 0]  # noqa: E731
-    position, yaw, zero = read(log.position), read(log.yaw), jnp.zeros(count, jnp.float32)
-    speed = jnp.where(drives, safe_norm(read(log.velocity)), 0.0)
+    position, yaw, zero = take_rows(log.position, entry), take_rows(log.yaw, entry), jnp.zeros(count, jnp.float32)
+    speed = jnp.where(drives, safe_norm(take_rows(log.velocity, entry)), 0.0)
     arc, shift, offset, turn = zero, zero, jnp.zeros((count, 2), jnp.float32), zero
     if corridor.has_routes(scene.routes):
         arc = corridor.project_points(scene.routes, log.route, position, yaw)

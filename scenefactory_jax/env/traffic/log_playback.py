@@ -162,7 +162,7 @@ def read_log(
     started, ahead, at_row = before >= 0, after < log.valid.shape[1], before == row
     bridged = ahead & ((after - before) * dt <= gap_s + track_interpolation.SNAP * dt)
     parked = is_parked(log, parked_m)
-    logged = jnp.take_along_axis(log.velocity, jnp.maximum(before, 0)[:, None, None], axis=1)[:, 0]
+    logged = track_interpolation.take_rows(log.velocity, jnp.maximum(before, 0))
     velocity = jnp.where(at_row[:, None], logged, velocity)  # also at the last row
     boxes = Boxes(
         position=position,
@@ -190,8 +190,8 @@ def is_parked(log: TrafficLog, within_m: float) -> Bool[Array, " O"]:
     """Mask of vehicles that never leave their first position by `within_m`, nor are ever faster than that in a second: one that is seen for
     a moment only drives, and one that waits where another drives through after its track's end has driven on."""
     first = jnp.argmax(log.valid, axis=1)
-    begin = jnp.take_along_axis(log.position, first[:, None, None], axis=1)
-    squared = jnp.maximum(jnp.sum((log.position - begin) ** 2, axis=-1), jnp.sum(log.velocity**2, axis=-1))
+    begin = track_interpolation.take_rows(log.position, first)
+    squared = jnp.maximum(jnp.sum((log.position - begin[:, None]) ** 2, axis=-1), jnp.sum(log.velocity**2, axis=-1))
     moved = jnp.max(jnp.where(log.valid, squared, 0.0), axis=1, initial=0.0)
     return (log.kind == VEHICLE) & (moved < within_m**2) & ~log.leaves
 

@@ -14,10 +14,10 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
-from scenefactory_jax.core import track_interpolation
 from scenefactory_jax.core.geometry import heading_vector, safe_norm, to_frame, wrap_angle
 from scenefactory_jax.core.pytree import replace
 from scenefactory_jax.core.schema import Bounds, Count, NonNegative, Positive
+from scenefactory_jax.core.track_interpolation import SNAP, take_rows
 from scenefactory_jax.core.types import Boxes, RoadUser, Scene, Traffic, TrafficLog
 from scenefactory_jax.env.traffic import corridor, idm_law
 from scenefactory_jax.env.traffic.corridor import Window
@@ -108,7 +108,7 @@ def trajectory_idm_traffic(
         selection, clearance: see `reactive`.
         reactive: metadrive: vehicles that move and begin behind the first agent, with its heading; they enter wherever their track begins.
             all: every vehicle that moves; one whose track begins later than the episode enters once there is room. Pedestrians and cyclists
-            follow their log, and wait while a car is in their way. Nobody comes to stand where a car is.
+            follow their log, and wait while a car is in their way. Nobody appears where a car is.
         kinds, parked_m, gap_s, mass_kg, start_row, elevation_m: as in `log_traffic`.
 
     Raises:
@@ -155,14 +155,12 @@ def init(scene: Scene, row: Int[Array, ""], selection: Selection, *, choose: str
     rows = jnp.arange(log.valid.shape[1])
     later = log.valid & (rows >= row)
     first = jnp.argmax(later, axis=1)
-    read = lambda table: jnp.take_along_axis(table, first.reshape(-1, *[1] * (table.ndim - 1)), axis=1)[:, 0]  # noqa: E731
     count = jnp.maximum(jnp.sum(later, axis=1), 1)
     mean = jnp.sum(jnp.where(later[..., None], log.position, 0.0), axis=1) / count[:, None]
     square = jnp.where(later[..., None], (log.position - mean[:, None]) ** 2, 0.0)
     spread = jnp.sqrt(jnp.sum(square, axis=1) / count[:, None])
     last = log.valid.shape[1] - 1 - jnp.argmax(later[:, ::-1], axis=1)
-    end = jnp.take_along_axis(log.position, last[:, None, None], axis=1)[:, 0]
-    place, yaw = read(log.position), read(log.yaw)
+    place, end, yaw = take_rows(log.position, first), take_rows(log.position, last), take_rows(log.yaw, first)
     moves = jnp.any(spread > selection.spread_m, axis=1) & (safe_norm(end - place) > selection.travel_m)
     reacts = (log.kind == VEHICLE) & jnp.any(later, axis=1) & moves
     skipped = jnp.zeros_like(reacts)
@@ -171,7 +169,7 @@ def init(scene: Scene, row: Int[Array, ""], selection: Selection, *, choose: str
         reacts &= chosen
         skipped = (log.kind == VEHICLE) & (near | (jnp.sum(log.valid, axis=1) < selection.min_rows))
     zero, none = jnp.zeros(len(reacts), jnp.float32), jnp.zeros_like(reacts)
-    speed = safe_norm(read(log.velocity))
+    speed = safe_norm(take_rows(log.velocity, first))
     return TrackState(reacts & ~skipped, skipped, first.astype(jnp.int32), none, zero, speed, zero, none, zero)
 
 
@@ -265,19 +263,16 @@ def find_entering(scene: Scene, state: TrackState, boxes: Boxes, begun: Bool[Arr
 
 def find_waiting(scene: Scene, reacts: Bool[Array, " O"], cars: Boxes, row: Float[Array, " O"], clearance: Clearance) -> Bool[Array, " O"]:
     """Mask of the road users at these rows of their log with a car on the way of their next `reaction_s`: of pedestrians and cyclists on
-    the road, but not of those that are hit, and of all that would come to stand on the road in the next row and do not react."""
+    the road, but not of those that are hit, and of all that would appear in the next row and do not react."""
     log, traffic, leveled = scene.traffic_log, scene.traffic, scene.edges.height is not None
-
-    def read(table: Array, at: Int[Array, " O"]) -> Array:
-        return jnp.take_along_axis(table, jnp.clip(at, 0, log.valid.shape[1] - 1).reshape(-1, *[1] * (table.ndim - 1)), axis=1)[:, 0]
-
-    following = jnp.floor(row + track_interpolation.SNAP).astype(jnp.int32) + 1
-    comes = ~traffic.present & read(log.valid, following) & ~reacts
-    logged = read(log.velocity, jnp.where(comes, following, jnp.round(row).astype(jnp.int32)))  # also of those that wait
+    last = log.valid.shape[1] - 1
+    nearest, following = (jnp.clip(at.astype(jnp.int32), 0, last) for at in (jnp.round(row), jnp.floor(row + SNAP) + 1))
+    comes = ~traffic.present & take_rows(log.valid, following) & ~reacts
+    logged = take_rows(log.velocity, jnp.where(comes, following, nearest))  # also of those that wait
     users = replace(
         traffic,
-        position=jnp.where(comes[:, None], read(log.position, following), traffic.position),
-        yaw=jnp.where(comes, read(log.yaw, following), traffic.yaw),
+        position=jnp.where(comes[:, None], take_rows(log.position, following), traffic.position),
+        yaw=jnp.where(comes, take_rows(log.yaw, following), traffic.yaw),
         velocity=logged,
         present=traffic.present | comes,
     )
