@@ -1,8 +1,9 @@
-"""How well agents follow their routes, computed on the device during an episode: gates, wrong way, completion, metres driven.
+"""How well agents follow their routes, computed on the device during an episode: gates, wrong way, red lights, completion, metres driven.
 
 A clean completion (suite `route100`): the car passes gates every 20 m along its route, 2.5 m to either side, and the last one, at the goal,
 within 30 degrees of the route's direction, in 10 s and a second for every 4 m of the route; it has no other event, and drives the wrong way
 for one second at most. Time does not count while the car stands and the next stop line on its route, up to 50 m ahead, has a red light.
+An approach to a red light begins when that line comes within 50 m or turns red there.
 """
 
 from dataclasses import dataclass
@@ -10,7 +11,7 @@ from typing import Annotated
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from scenefactory_jax.core.pytree import pytree_dataclass
 from scenefactory_jax.core.schema import Bounds, NonNegative, Positive
@@ -40,6 +41,8 @@ class RouteSignals:
     missed_gates: Int[Array, " A"]
     wrong_way_steps: Int[Array, " A"]
     red_steps: Int[Array, " A"]  # waiting for a red light
+    red_ahead: Bool[Array, " A"]  # the next stop line, near ahead, has a red light
+    red_approaches: Int[Array, " A"]  # how often that began
     completion: Float[Array, " A"]  # part of the route, 0 to 1
     goal_alignment: Float[Array, " A"]  # cosine between car and route in the last step
     driven: Float[Array, " A"]  # m
@@ -49,7 +52,7 @@ class RouteSignals:
 def begin_signals(state: State) -> RouteSignals:
     """Returns the signals at the start of an episode."""
     zero, none = jnp.zeros(state.active.shape, jnp.float32), jnp.zeros(state.active.shape, jnp.int32)
-    return RouteSignals(none, none, none, zero, zero, zero, zero)
+    return RouteSignals(none, none, none, jnp.zeros(state.active.shape, bool), none, zero, zero, zero, zero)
 
 
 def update_signals(
@@ -65,11 +68,14 @@ def update_signals(
     lines = read_stop_lines(scene, after, after.step.astype(jnp.float32) * control_dt)
     nearest = jnp.min(lines.distance, axis=1, keepdims=True, initial=course.queue_m)
     red = jnp.any(lines.red & (lines.distance <= nearest), axis=1)
+    begins = routed & red & ~signals.red_ahead
     missed = routed & (passes | at_goal) & (metrics.route_distance > course.gate_half_width_m)
     return RouteSignals(
         missed_gates=signals.missed_gates + missed.astype(jnp.int32),
         wrong_way_steps=signals.wrong_way_steps + (active & metrics.wrong_way).astype(jnp.int32),
         red_steps=signals.red_steps + (routed & red & (metrics.speed < course.stand_mps)).astype(jnp.int32),
+        red_ahead=red,
+        red_approaches=signals.red_approaches + begins.astype(jnp.int32),
         completion=jnp.where(routed, metrics.route_completion, signals.completion),
         goal_alignment=jnp.where(routed, metrics.route_alignment, signals.goal_alignment),
         driven=signals.driven + jnp.where(active, metrics.speed * control_dt, 0.0),
@@ -95,6 +101,7 @@ def make_columns(signals: RouteSignals, records: Records, *, course: CourseThres
         "missed_gates": np.asarray(signals.missed_gates),
         "against_s": wrong_way_s,
         "red_light_wait_s": red_s,
+        "red_light_approaches": np.asarray(signals.red_approaches),
         "driven_m": np.asarray(signals.driven),
         "max_overspeed_mps": np.asarray(signals.overspeed),
         "clean_completion": clean & records["has_route"],

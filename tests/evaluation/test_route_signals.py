@@ -27,7 +27,7 @@ def test_waiting_for_a_red_light_is_not_counted():
     course = schema.read(load_config("evaluate")["failures"]["course"], route_signals.CourseThresholds)
     lights = [((40.0, 0.0), [(0.0, STOP), (GREEN_S, GO)], np.inf)]
     lines = [LINE + np.array([0.0, 4.0 * row]) for row in range(4)]
-    scene = routed_scene(lines, starts=[68.0, 18.0, 40.0, 105.0], speeds=[0, 0, 6, 0], controls=lights, stops=[[(100.0, 0)]] * 4)
+    scene = routed_scene(lines, starts=[68.0, 18.0, 45.0, 105.0], speeds=[0, 0, 6, 0], controls=lights, stops=[[(100.0, 0)]] * 4)
 
     @jax.jit
     def drive(scene):
@@ -41,6 +41,7 @@ def test_waiting_for_a_red_light_is_not_counted():
 
     signals = jax.device_get(drive(scene))
     assert signals.red_steps.tolist() == [29, 0, 0, 0], "it is green in the 30th step"
+    assert signals.red_approaches.tolist() == [1, 0, 1, 0], "the second is more than 50 m away, the third comes nearer"
     records = {name: np.full(4, name == "goal_reached") for name in EVENTS} | {"has_route": np.ones(4, bool), "route_m": np.full(4, 40.0)}
     for late, clean in ((0.0, True), (0.9, True), (1.1, False)):
         records["time_s"] = np.full(4, course.start_s + 40.0 / course.speed_mps + late)

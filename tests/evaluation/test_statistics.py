@@ -115,6 +115,15 @@ def test_a_rate_over_a_distance_is_a_sum_over_a_sum():
     assert "collisions_per_100_km" not in statistics.summarise(records(np.ones((1, 8))), bootstrap=10, seed=0), "nobody has a route"
 
 
+def test_red_lights_count_by_approaches():
+    """One car runs the only light it comes to, one waits for three, one comes to none; the last has no route."""
+    rows = records(np.ones((1, 4)), red_light=np.arange(4)[None] == 0, red_light_approaches=np.array([[1, 3, 0, 5]]))
+    rows |= {"has_route": np.arange(4) < 3}
+    assert statistics.summarise(rows, bootstrap=10, seed=0)["red_light_per_approach"].value == pytest.approx(1 / 4)
+    del rows["red_light_approaches"]
+    assert "red_light_per_approach" not in statistics.summarise(rows, bootstrap=10, seed=0), "not known of older tables"
+
+
 def test_probability_of_a_difference_is_that_of_the_binomial():
     """Of 16 scenes 11 gain and 5 lose: a resample shows no gain if 8 or fewer of its scenes are of those that gain."""
     before, after = np.zeros((16, 1)), np.zeros((16, 1))
