@@ -5,6 +5,7 @@ track. Here chains end where they are long enough, because all chains of ten lan
 """
 
 import bisect
+import itertools
 import math
 from collections import deque
 from collections.abc import Iterator, Sequence
@@ -22,6 +23,7 @@ from scenefactory_jax.roadgraph.lane_graph import LaneGraph
 ROOT_RADIUS_M = (2.5, 5.0)  # of the lanes at which routes begin: the second if there is none within the first
 ROOT_COSINE = 0.5  # between lane and car
 MAX_LANES = 10  # of a chain
+REACH_SLACK_M = 10.0  # of a chain beyond the way of a track, for places beside its lanes
 BOUND_SLACK_M = 1e-6  # far above the rounding of a distance
 STRIDE = 4  # vertices of a lane of which one is looked at first
 MIN_STEP_M = 1e-3  # between vertices of a route
@@ -68,12 +70,19 @@ def make_lane_map(graph: LaneGraph) -> LaneMap:
 
 
 def find_track_routes(
-    lanes: LaneMap, track: Float[np.ndarray, "L 2"], yaw: float, *, count: int, max_length_m: float, max_distance_m: float
+    lanes: LaneMap,
+    track: Float[np.ndarray, "L 2"],
+    yaw: float,
+    *,
+    count: int,
+    max_length_m: float,
+    max_distance_m: float,
+    max_end_distance_m: float = math.inf,
 ) -> list[SampledRoute]:
     """Finds the routes that a track may have meant, the nearest to the track first.
 
-    A track that no chain of lanes follows within `max_distance_m` is a route itself, without alternatives. Routes begin at the point
-    nearest to the track's first position.
+    A track that no chain of lanes follows within `max_distance_m`, and at its end within `max_end_distance_m`, is a route itself, without
+    alternatives. Routes begin at the point nearest to the track's first position.
 
     Args:
         track: valid positions in order; two different ones at least.
@@ -81,16 +90,19 @@ def find_track_routes(
         count: most routes.
         max_length_m: at which routes end.
     """
-    chains = [chain for root in _find_roots(lanes, track[0], yaw) for chain in _list_chains(lanes, root, track[0], max_length_m)]
-    kept = _drop_parts(chains)
+    roots = _find_roots(lanes, track[0], yaw)
+    behind = {root: float(shapely.line_locate_point(lanes.shapes[root], shapely.Point(track[0]))) for root in roots}
+    kept = _drop_parts([chain for root in roots for chain in _list_chains(lanes, root, behind[root], max_length_m)])
     if not kept:
         return [sample_track(track, max_length_m)]
-    offsets = _measure_offsets(lanes, kept, track)
+    reach = REACH_SLACK_M + float(segment_lengths(track[1:] - track[:-1]).sum())
+    offsets = _measure_offsets(lanes, [_cut_chain(lanes, chain, behind[chain[0]] + reach) for chain in kept], track)
     order = sorted(range(len(kept)), key=lambda place: float(offsets[place].sum()))[:count]
-    if offsets[order[0]].max() > max_distance_m:
+    nearest = offsets[order[0]]
+    if nearest.max() > max_distance_m or nearest[-1] > max_end_distance_m:
         return [sample_track(track, max_length_m)]
     chosen = [kept[place] for place in order]
-    along = shapely.line_locate_point(lanes.shapes[[chain[0] for chain in chosen]], shapely.Point(track[0]))
+    along = [behind[chain[0]] for chain in chosen]
     found = sample_chains(lanes, chosen, *_locate(lanes.graph, [chain[0] for chain in chosen], along), max_length_m)
     end = int(np.argmin(np.linalg.norm(found[0].xy - track[-1], axis=1)))
     beginning = found[0].xy[: end + 1]
@@ -114,9 +126,8 @@ def _find_roots(lanes: LaneMap, place: Float[np.ndarray, "2"], yaw: float) -> li
     return []
 
 
-def _list_chains(lanes: LaneMap, root: int, place: Float[np.ndarray, "2"], max_length_m: float) -> Iterator[tuple[int, ...]]:
-    """Lists chains of successors from a lane until they are long enough; a lane that repeats ends a chain."""
-    behind = float(shapely.line_locate_point(lanes.shapes[root], shapely.Point(place)))
+def _list_chains(lanes: LaneMap, root: int, behind: float, max_length_m: float) -> Iterator[tuple[int, ...]]:
+    """Lists chains of successors from a length along a lane until they are long enough; a lane that repeats ends a chain."""
     pending: deque[tuple[tuple[int, ...], float]] = deque([((root,), float(lanes.graph.length[root]) - behind)])
     listed = 0
     while pending and listed < MAX_CHAINS:
@@ -135,6 +146,12 @@ def _drop_parts(chains: list[tuple[int, ...]]) -> list[tuple[int, ...]]:
     for chain in chains:  # of chains with the same lanes the first, whose root is the better one
         kept.setdefault(sum(1 << lane for lane in chain), chain)  # a set as the bits of an integer
     return [chain for bits, chain in kept.items() if not any(bits & other == bits and bits != other for other in kept)]
+
+
+def _cut_chain(lanes: LaneMap, chain: tuple[int, ...], length_m: float) -> tuple[int, ...]:
+    """The lanes of a chain that begin within a length: what a track can have driven, and not what comes back to it on a loop."""
+    begins = itertools.accumulate((float(lanes.graph.length[lane]) for lane in chain[:-1]), initial=0.0)
+    return tuple(lane for lane, begin in zip(chain, begins, strict=True) if begin <= length_m)
 
 
 def _measure_offsets(lanes: LaneMap, chains: list[tuple[int, ...]], track: Float[np.ndarray, "L 2"]) -> list[Float[np.ndarray, " L"]]:

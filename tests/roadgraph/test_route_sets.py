@@ -1,5 +1,7 @@
 """Routes that a track may have meant, and drawn routes, on lanes made by hand."""
 
+import itertools
+
 import numpy as np
 import pytest
 
@@ -66,6 +68,30 @@ def test_a_track_beside_lanes_is_a_route_itself(fork):
     for yaw, track in ((np.pi, line((30, 0), (5, 0), 4.0)), (0.0, line((0, -20), (30, -20), 4.0))):  # backwards; on a bicycle lane
         (route,) = route_sets.find_track_routes(fork, track, yaw, count=3, **LIMITS)
         assert not route.along_lanes
+
+
+def test_a_track_that_ends_in_another_lane_is_a_route_itself(fork):
+    """It changes from the first lane to the one 3.6 m beside it, which it follows within 3.5 m to its last point."""
+    change = np.stack([np.linspace(5, 75, 15), np.linspace(0, 3.4, 15)], axis=1)
+    ends = {"max_end_distance_m": 2.0}
+    assert route_sets.find_track_routes(fork, change, 0.0, count=1, **LIMITS)[0].along_lanes
+    (route,) = route_sets.find_track_routes(fork, change, 0.0, count=1, **LIMITS, **ends)
+    assert not route.along_lanes
+    np.testing.assert_allclose(route.xy[-1], change[-1], atol=1e-9)
+    further = np.append(change, line((80, 1.9), (120, 1.9), 5.0), axis=0)  # it comes back
+    assert route_sets.find_track_routes(fork, further, 0.0, count=1, **LIMITS, **ends)[0].along_lanes
+
+
+def test_a_loop_that_comes_back_to_the_track_is_no_route_of_it():
+    """A car turns right where another lane turns left, goes round and passes the same way, even nearer to the car's track."""
+    turn = [[0, 0], [8, 0], [10.2, -2], [10.2, -60]]
+    loop = [[0, 0], [10, 0], [20, 10], [20, 60], [-40, 60], [-40, 0], [-1, 0]]
+    bend = lambda corners: np.concatenate([line(a, b) for a, b in itertools.pairwise(corners)])  # noqa: E731
+    lanes = [lane(1, bend(loop), [3]), lane(2, bend(turn) + np.array([0.3, 0])), lane(3, bend([[-1, 0], *turn[1:]]))]
+    lanes = route_sets.make_lane_map(lane_graph.make(lanes))
+    track = bend([[1, 0.1], [8, 0.1], [10.2, -2], [10.2, -30]])
+    found = route_sets.find_track_routes(lanes, track, 0.0, count=2, **LIMITS)
+    assert [names(lanes, route) for route in found] == [[2], [1, 3]]
 
 
 def test_routes_end_at_their_longest_length(fork):

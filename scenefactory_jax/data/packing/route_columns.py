@@ -1,5 +1,6 @@
 """The routes of a scene as columns: the agents' own and their alternatives, those of moving vehicles of the traffic, and drawn ones."""
 
+import math
 import zlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -37,6 +38,7 @@ class RouteConfig:
     attempts: Count
     stop_distance_m: Positive  # of a stop place from the line of a route
     lanes: dict[str, Any]  # the config group `lanes`
+    max_goal_distance_m: Positive = math.inf  # of an agent's goal from its route; runs of before there was the key have none
 
 
 @dataclass(frozen=True)
@@ -90,7 +92,8 @@ def pack_routes(
         if slot < 0 and not _is_moving(raw, logs, index, config.min_travel_m):
             options = _find_waiting_routes(lanes, raw, logs, index, config, count=1, half=half)
         else:
-            options = _find_routes(lanes, raw, logs, index, config, count=config.alternatives if slot >= 0 else 1, half=half)
+            count, goal_m = (config.alternatives, config.max_goal_distance_m) if slot >= 0 else (1, math.inf)
+            options = _find_routes(lanes, raw, logs, index, config, count=count, max_end_distance_m=goal_m, half=half)
         first[index], routed[index] = len(found), bool(options)
         found += options
         owner += [slot] * len(options)
@@ -135,17 +138,15 @@ def _is_moving(raw: RawScene, logs: Logs, index: int, min_travel_m: float) -> bo
 
 
 def _find_routes(
-    lanes: LaneMap, raw: RawScene, logs: Logs, index: int, config: RouteConfig, *, count: int, half: float
+    lanes: LaneMap, raw: RawScene, logs: Logs, index: int, config: RouteConfig, *, count: int, max_end_distance_m: float, half: float
 ) -> list[SampledRoute]:
     """The routes of a track within the square; those of a track that does not move lead on from where it waits."""
     valid = logs.valid[index]
     track, yaw = logs.xyz[index, valid, :2], float(logs.yaw[index, valid][0])
     if len(track) < 2 or np.linalg.norm(track - track[0], axis=1).max() < ROUTE_SPACING_M:
         return _find_waiting_routes(lanes, raw, logs, index, config, count=count, half=half)
-    options = route_sets.find_track_routes(
-        lanes, track, yaw, count=count, max_length_m=config.length_m, max_distance_m=config.max_distance_m
-    )
-    return _cut(options, half)
+    numbers = {"max_length_m": config.length_m, "max_distance_m": config.max_distance_m, "max_end_distance_m": max_end_distance_m}
+    return _cut(route_sets.find_track_routes(lanes, track, yaw, count=count, **numbers), half)
 
 
 def _find_waiting_routes(
