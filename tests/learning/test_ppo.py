@@ -166,6 +166,21 @@ def test_left_out_samples_are_counted_for_each_group():
     assert float(minibatches.count_left_out(weight, jnp.float32(28.0), size=12, groups=2, axis=None)) == pytest.approx(20 / 28)
 
 
+def test_minibatches_hold_the_largest_advantages():
+    """Of each of two groups of 24 samples the 8 largest that have weight; of a group with fewer samples all."""
+    rng = np.random.default_rng(7)
+    advantage, weight = rng.normal(size=48).astype(np.float32), (rng.random(48) < 0.7).astype(np.float32)
+    weight[24:] = np.arange(24) < 5
+    chosen = np.asarray(minibatches.select_largest(jnp.asarray(weight), jnp.asarray(advantage), count=16, groups=2))
+    for part in (slice(0, 24), slice(24, 48)):
+        order = np.argsort(-np.where(weight[part] > 0, np.abs(advantage[part]), -1.0))
+        assert sorted(np.flatnonzero(chosen[part])) == sorted(order[: min(8, int(weight[part].sum()))])
+    split = minibatches.split_minibatches(jax.random.key(0), jnp.asarray(chosen), minibatches=2, size=8, groups=2)
+    assert chosen[np.asarray(split)].sum() == 13
+    config = ppo_config(advantage_fraction=0.25, horizon=16, minibatches=2)
+    assert minibatches.minibatch_size(config, (4, 3), groups=2) == 24
+
+
 def test_minibatches_that_are_not_finite_are_skipped_and_counted(batch):
     """Two minibatches of 12."""
     policy, parameters, samples = batch
@@ -322,7 +337,8 @@ def test_mistakes_are_named():
     with pytest.raises(ConfigError, match=r"ppo\.learning_rate: expected a number in .* = \[1e-05, 0.01\], got 1\.0"):
         ppo_config(learning_rate=1.0)
     wrong = {"gamma": 1.5, "desired_kl": -0.01, "value_clip": 0.0, "ent_coef": float("nan"), "vf_coef": -1.0, "max_grad_norm": 0.0}
-    for name, value in {**wrong, "sample_fraction": 1.1, "horizon": 0, "epochs": 1.5, "permutation": "never"}.items():
+    wrong |= {"sample_fraction": 1.1, "advantage_fraction": 0.0}
+    for name, value in {**wrong, "horizon": 0, "epochs": 1.5, "permutation": "never"}.items():
         with pytest.raises(ConfigError, match=rf"ppo\.{name}: expected .*, got {value!r}"):
             ppo_config(**{name: value})
 

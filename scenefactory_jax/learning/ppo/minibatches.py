@@ -24,11 +24,13 @@ def minibatch_size(config: PPOConfig, shape: tuple[int, ...], *, groups: int = 1
     samples = config.horizon * worlds * agents
     if worlds % groups:
         raise ConfigError(f"worlds: expected a multiple of {groups} shards, got {worlds}")
-    size = config.horizon * count_kept(config, shape, groups=groups) // config.minibatches * groups
-    if size < 1 or (config.sample_fraction == 1.0 and samples % (config.minibatches * groups)):
+    used = int(config.horizon * count_kept(config, shape, groups=groups) * config.advantage_fraction)
+    size = used // config.minibatches * groups
+    if size < 1 or (config.sample_fraction == config.advantage_fraction == 1.0 and samples % (config.minibatches * groups)):
         product = f"horizon {config.horizon} x {worlds} worlds x {agents} agents = {samples} samples"
         parts = f"{config.minibatches} minibatches" + (f" of {groups} shards" if groups > 1 else "")
-        raise ConfigError(f"ppo.minibatches: {product} (sample_fraction {config.sample_fraction}) do not divide into {parts}")
+        fractions = f"sample_fraction {config.sample_fraction}, advantage_fraction {config.advantage_fraction}"
+        raise ConfigError(f"ppo.minibatches: {product} ({fractions}) do not divide into {parts}")
     return size
 
 
@@ -47,6 +49,13 @@ def flatten(x: Array, *, groups: int) -> Array:
 def flatten_kept(x: Array, kept: Int[Array, "T G K"] | None, *, groups: int) -> Array:
     """Flattens [T, W, A, ...] to [T * G * K, ...], the slots that a rollout kept, or all; one group of worlds after the other."""
     return flatten(x if kept is None else jax.vmap(take_slots)(x, kept), groups=groups)
+
+
+def select_largest(weight: Float[Array, " N"], advantage: Float[Array, " N"], *, count: int, groups: int) -> Float[Array, " N"]:
+    """Takes the weight of all samples but those with the `count` largest absolute advantages of all groups, an equal part of each."""
+    size = jnp.where(weight > 0.0, jnp.abs(advantage), -1.0).reshape(groups, -1)
+    least = jnp.sort(size, axis=1)[:, -(count // groups), None]
+    return jnp.where(size >= least, weight.reshape(groups, -1), 0.0).reshape(-1)
 
 
 def split_minibatches(

@@ -30,6 +30,7 @@ from scenefactory_jax.learning.ppo.minibatches import (
     flatten,
     flatten_kept,
     minibatch_size,
+    select_largest,
     split_minibatches,
 )
 from scenefactory_jax.learning.trainer import Metrics, Trainer, TrainState
@@ -157,7 +158,10 @@ def update_epochs(
     config = ppo.config
     update = functools.partial(update_minibatch, ppo, batch, max_learning_rate(config, train_state.iteration))
     groups = {"groups": ppo.groups, "axis": ppo.axis}
-    split = functools.partial(split_minibatches, weight=batch.weight, size=size, minibatches=config.minibatches, **groups)
+    weight = batch.weight
+    if config.advantage_fraction < 1.0:
+        weight = select_largest(weight, batch.advantage, count=size * config.minibatches, groups=ppo.groups)
+    split = functools.partial(split_minibatches, weight=weight, size=size, minibatches=config.minibatches, **groups)
 
     def epoch(carry: tuple, key: PRNGKeyArray) -> tuple[tuple, dict[str, Array]]:
         return jax.lax.scan(update, carry, split(key))
