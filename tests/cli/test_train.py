@@ -526,7 +526,7 @@ def test_only_our_own_command_line_counts_as_a_command(monkeypatch):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["train", "ppo.horizn=3"], "error: ppo.horizn: unknown key 'horizn'; ppo has: clip_eps, "),
+        (["train", "ppo.horizn=3"], "error: ppo.horizn: unknown key 'horizn'; ppo has: advantage_fraction, clip_eps, "),
         (["train", "worlds=many"], "error: worlds: expected an integer >= 1, got 'many'"),
         (["train", "scenes.path=/nowhere", "experiment=smoke"], "error: /nowhere: no such file or folder"),
         (["evaluate"], "error: run: missing; give run=..., or planners=[...] alone, as `evaluate --help` describes it"),
