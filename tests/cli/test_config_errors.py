@@ -155,7 +155,8 @@ def test_a_name_leads_nowhere_and_can_be_printed(tmp_path, capsys):
         ("dynamics=hover", r"Could not find 'dynamics/hover' Available options in 'dynamics': articulated articulated_paper base"),
         (
             "experiment=smok",
-            r"Could not find 'experiment/smok' Available options in 'experiment': bicycle demo drive generalist generalist_fine.* smoke",
+            r"Could not find 'experiment/smok' Available options in 'experiment': "
+            r"bicycle demo drive generalist generalist_finetune laptop .* smoke",
         ),
         ("dynamics={_target_: mine.make, gain: 1.0}", r"to replace all of dynamics: ~dynamics \+dynamics=\{\.\.\.\}"),
         ("timing=null", r"timing=null: "),

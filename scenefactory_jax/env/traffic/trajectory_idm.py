@@ -108,7 +108,7 @@ def trajectory_idm_traffic(
         selection, clearance: see `reactive`.
         reactive: metadrive: vehicles that move and begin behind the first agent, with its heading; they enter wherever their track begins.
             all: every vehicle that moves; one whose track begins later than the episode enters once there is room. Pedestrians and cyclists
-            follow their log, and wait while a car is in their way. Nobody appears where a car is.
+            follow their log, and wait while a car is in their way. No road user appears inside a car.
         kinds, parked_m, gap_s, mass_kg, start_row, elevation_m: as in `log_traffic`.
 
     Raises:

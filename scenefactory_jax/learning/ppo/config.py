@@ -36,8 +36,8 @@ class PPOConfig:
     # of the rewards that are learnt from, as in Brax; those of metrics are not scaled. The gradient's norm is that of actor and critic:
     # where returns are large, `max_grad_norm` bounds the critic's and leaves little of the actor's
     reward_scaling: Positive = 1.0
-    # of the samples that are kept, that minibatches hold: those with the largest advantages (Cusumano-Towner et al. 2025, algorithm 1, by a
-    # threshold)
+    # part of the kept samples that minibatches use: those with the largest advantages (Cusumano-Towner et al. 2025, algorithm 1, where a
+    # threshold chooses them)
     advantage_fraction: Annotated[float, Bounds(above=0, max=1)] = 1.0
 
     def __post_init__(self) -> None:
