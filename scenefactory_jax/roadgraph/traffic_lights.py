@@ -47,12 +47,21 @@ def _take(table: Shaped[Array, "C N"], place: Int[Array, " C"]) -> Shaped[Array,
     return jnp.take_along_axis(table, jnp.clip(place, 0, table.shape[1] - 1)[:, None], axis=1)[:, 0]
 
 
-def find_red(states: Int[Array, " C"]) -> Bool[Array, " C"]:
+def find_red(states: Int[Array, "*n"]) -> Bool[Array, "*n"]:
     """Mask of the lights that forbid to enter."""
-    red = jnp.zeros(states.shape, bool)
-    for code in RED_STATES:
-        red = red | (states == code)
-    return red
+    return _is_any(states, RED_STATES)
+
+
+def find_yellow(states: Int[Array, "*n"]) -> Bool[Array, "*n"]:
+    """Mask of the lights that are about to turn red."""
+    return _is_any(states, YELLOW_STATES)
+
+
+def _is_any(states: Int[Array, "*n"], codes: tuple[int, ...]) -> Bool[Array, "*n"]:
+    found = jnp.zeros(states.shape, bool)
+    for code in codes:
+        found = found | (states == code)
+    return found
 
 
 def encode_colour(states: Int[Array, "*n"]) -> Float[Array, "*n 4"]:

@@ -107,22 +107,25 @@ def test_a_stop_sign_asks_for_standing_before_it(glide):
 
 
 def test_speed_before_lines_that_demand_a_stop(env):
-    """Fronts 8 m before the line, the last one behind it: braking of 4 m/s^2 stops from 8 m/s."""
-    sign, red, green = 0, 1, 2
+    """Fronts 8 m before the line, that of the last red one behind it: braking of 4 m/s^2 stops from 8 m/s. Yellow for 1.5 s."""
+    sign, red, green, yellow = range(4)
     cases = [  # control, speed, start, whether the car has stood, the term
         (sign, 7.9, 0.0, False, 0.0), (sign, 10.0, 0.0, False, 0.5), (sign, 20.0, 0.0, False, 1.0), (sign, 20.0, 0.0, True, 0.0),
         (red, 7.9, 0.0, False, 0.0), (red, 10.0, 0.0, True, 0.5), (green, 20.0, 0.0, False, 0.0), (red, 20.0, 9.0, False, 0.0),
+        (yellow, 7.9, 0.0, False, 0.0), (yellow, 10.0, 0.0, False, 0.5), (yellow, 12.5, 0.0, False, 0.0),
     ]  # fmt: skip
     control, speeds, starts, stood, expected = zip(*cases, strict=True)
-    controls = [((-40.0, 0.0), changes, np.inf) for changes in (None, [(0.0, STOP)], [(0.0, GO)])]
+    controls = [((-40.0, 0.0), changes, np.inf) for changes in (None, [(0.0, STOP)], [(0.0, GO)], [(-1.5, CAUTION)])]
     lines = [STRAIGHT + np.array([0.0, 5.0 * row]) for row in range(len(cases))]
     scene = routed_scene(lines, starts=starts, speeds=speeds, controls=controls, stops=[[(10.0, which)] for which in control])
     state = env.reset(jax.random.key(0), scene)[0]
     state, action = replace(state, route=replace(state.route, stood=column_of(stood, bool))), jnp.zeros((len(cases), 3))
     result = jax.jit(env.step)(scene, state, action)[1]
     step = RewardInput(scene, state, action, state, result.metrics, result.events)
-    found = jax.jit(functools.partial(rewards.stop_line_speed, braking_mps2=4.0, limit_mps=4.0, control_dt=1 / 30))(step)
-    np.testing.assert_allclose(found, expected, atol=1e-5)
+    term = functools.partial(rewards.stop_line_speed, braking_mps2=4.0, limit_mps=4.0, control_dt=1 / 30)
+    np.testing.assert_allclose(jax.jit(functools.partial(term, late_yellow=True))(step), expected, atol=1e-5)
+    before = np.where(np.array(control) == yellow, 0.0, expected)
+    np.testing.assert_allclose(jax.jit(term)(step), before, atol=1e-5)
 
 
 def test_lights_follow_their_changes_and_periods():

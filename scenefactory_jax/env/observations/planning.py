@@ -8,11 +8,11 @@ from jaxtyping import Array, Bool, Float, Int
 
 from scenefactory_jax.core.geometry import dot, to_frame, wrap_angle
 from scenefactory_jax.core.schema import Count, NonNegative, Positive
-from scenefactory_jax.core.types import ROAD_USERS, YELLOW_STATES, Motion, Scene, State
+from scenefactory_jax.core.types import ROAD_USERS, Motion, Scene, State
 from scenefactory_jax.env import route_following, surrogate_safety
 from scenefactory_jax.env.observations.near_segments import NearSegments, gather_nearest
 from scenefactory_jax.env.observations.state_vectors import friction_ahead
-from scenefactory_jax.roadgraph import elevation, nearest_rows
+from scenefactory_jax.roadgraph import elevation, nearest_rows, traffic_lights
 
 SPACING_M = 1.0  # between the points of the centre line
 
@@ -154,7 +154,7 @@ def read_stop_lines(scene: Scene, state: State, time_s: Float[Array, ""]) -> Sto
     """Reads the stop lines ahead of the agents on their routes."""
     lines = route_following.find_stop_lines(scene, state.agents, state.route.arc, time_s)
     ahead = (lines.distance > 0) & jnp.isfinite(lines.distance) & route_following.find_routed(scene, state.agents)[:, None]
-    yellow = jnp.any(lines.state[..., None] == jnp.array(YELLOW_STATES), axis=-1)
+    yellow = traffic_lights.find_yellow(lines.state)
     next_line = jnp.cumsum(ahead, axis=1) == 1
     waits = lines.stop_sign & ~(state.route.stood[:, None] & next_line)
     return StopLinesAhead(jnp.where(ahead, lines.distance, jnp.inf), ahead & lines.red, ahead & yellow, ahead & waits)

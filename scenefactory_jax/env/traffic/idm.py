@@ -16,7 +16,7 @@ from scenefactory_jax.core.geometry import dot, heading_vector, safe_norm, to_fr
 from scenefactory_jax.core.pytree import replace
 from scenefactory_jax.core.schema import NonNegative
 from scenefactory_jax.core.track_interpolation import take_rows
-from scenefactory_jax.core.types import YELLOW_STATES, Boxes, RoadUser, Scene, Traffic, TrafficLog
+from scenefactory_jax.core.types import Boxes, RoadUser, Scene, Traffic, TrafficLog
 from scenefactory_jax.env.traffic import corridor, idm_law, right_of_way
 from scenefactory_jax.env.traffic.corridor import Projection
 from scenefactory_jax.env.traffic.idm_config import IdmConfig
@@ -295,9 +295,8 @@ def find_stop_distance(
     arc, control = routes.stop_arc[route], routes.stop_control[route]
     distance, speed = arc - front[:, None], state.speed[:, None]
     states = traffic_lights.read_light_states(scene.controls, time_s)
-    yellow = jnp.any(jnp.stack([states == code for code in YELLOW_STATES]), axis=0)[control]
     stops = traffic_lights.find_red(states)[control] & idm_law.can_stop(speed, distance, config.max_braking_mps2)
-    stops |= yellow & idm_law.can_stop(speed, distance, law.braking_mps2)
+    stops |= traffic_lights.find_yellow(states)[control] & idm_law.can_stop(speed, distance, law.braking_mps2)
     stops |= scene.controls.stop_sign[control] & (arc > state.served[:, None])
     return jnp.minimum(nearest, jnp.min(jnp.where(stops & (distance > 0), distance, jnp.inf), axis=1))
 
