@@ -77,8 +77,8 @@ def stop_line_speed(
     allowed speed is sqrt(2 b d) at a distance d of the front. 0 without such a line ahead.
 
     Args:
-        late_yellow: a yellow light demands a stop as well, once it has been yellow for longer than v / 2b: a car that came up at its speed v
-            and is still before the line could have stopped when the light changed.
+        late_yellow: a yellow light demands a stop as well, once it has been yellow for longer than v / 2b: a car that came up at its
+            speed v and is still before the line could have stopped when the light changed.
     """
     state, time_s = step.after, step.after.step.astype(jnp.float32) * control_dt
     lines = route_following.find_stop_lines(step.scene, state.agents, state.route.arc, time_s)

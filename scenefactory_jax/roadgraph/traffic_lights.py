@@ -49,19 +49,12 @@ def _take(table: Shaped[Array, "C N"], place: Int[Array, " C"]) -> Shaped[Array,
 
 def find_red(states: Int[Array, "*n"]) -> Bool[Array, "*n"]:
     """Mask of the lights that forbid to enter."""
-    return _is_any(states, RED_STATES)
+    return jnp.isin(states, jnp.array(RED_STATES))
 
 
 def find_yellow(states: Int[Array, "*n"]) -> Bool[Array, "*n"]:
     """Mask of the lights that are about to turn red."""
-    return _is_any(states, YELLOW_STATES)
-
-
-def _is_any(states: Int[Array, "*n"], codes: tuple[int, ...]) -> Bool[Array, "*n"]:
-    found = jnp.zeros(states.shape, bool)
-    for code in codes:
-        found = found | (states == code)
-    return found
+    return jnp.isin(states, jnp.array(YELLOW_STATES))
 
 
 def encode_colour(states: Int[Array, "*n"]) -> Float[Array, "*n 4"]:

@@ -11,13 +11,13 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from scenefactory_jax.core.geometry import safe_norm
-from scenefactory_jax.core.types import RED_STATES
 from scenefactory_jax.env import planning_metrics
 from scenefactory_jax.env.step_metrics import StepMetricsConfig
 from scenefactory_jax.evaluation.metrics import nuplan_steps, scenarionet_steps, vmax_steps, waymax_steps
 from scenefactory_jax.evaluation.metrics.episode_record import CYCLIST, OBJECT, PEDESTRIAN, VEHICLE, EpisodeRecord, find_inside, find_span
 from scenefactory_jax.evaluation.metrics.episode_safety import compute_impact
 from scenefactory_jax.evaluation.metrics.episode_steps import StepMetrics, measure_steps
+from scenefactory_jax.roadgraph import traffic_lights
 
 
 class Value(NamedTuple):
@@ -93,7 +93,7 @@ def find_red_light_runs(record: EpisodeRecord, steps: StepMetrics) -> Bool[Array
     """Finds the states in which the car's front comes onto a lane with a red light."""
     lights = record.lights
     before = jnp.concatenate([steps.front_lane[:1], steps.front_lane[:-1]])
-    red = jnp.isin(lights.state, jnp.array(RED_STATES)) & (lights.lane == steps.front_lane[:, None])
+    red = traffic_lights.find_red(lights.state) & (lights.lane == steps.front_lane[:, None])
     return (steps.front_lane != before) & jnp.any(red, axis=1)
 
 

@@ -11,8 +11,8 @@ from jaxtyping import Array, Bool, Float, Int
 
 from scenefactory_jax.core.boxes import compute_corners
 from scenefactory_jax.core.geometry import heading_vector, safe_norm
-from scenefactory_jax.core.types import RED_STATES
 from scenefactory_jax.dynamics.bicycle_waymax import compute_inverse_action
+from scenefactory_jax.roadgraph import traffic_lights
 from scenefactory_jax.roadgraph.signed_edge_distance import EdgePoints, compute_signed_distance
 
 HEIGHT_SCALE = 2.0  # of the search for the nearest road-edge point
@@ -100,7 +100,7 @@ def find_red_light_run(
     Args:
         light_lane, state: lane and state, an index into LIGHT_STATES, of each light now.
     """
-    red = jnp.isin(state, jnp.array(RED_STATES))
+    red = traffic_lights.find_red(state)
     return (lane != lane_before) & jnp.any(red & (light_lane == lane))
 
 
