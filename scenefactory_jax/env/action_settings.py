@@ -8,7 +8,7 @@ from typing import Any, Literal
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from scenefactory_jax.core.schema import ConfigError, Count, Positive
+from scenefactory_jax.core.schema import ConfigError, Count, Fraction, Positive
 
 
 @dataclasses.dataclass(frozen=True)
@@ -18,6 +18,7 @@ class Rates:
     up_per_s: Positive  # throttle less brake, in [-1, 1]
     down_per_s: Positive
     steer_per_s: Positive
+    most_throttle: Fraction = 1.0
 
 
 @dataclasses.dataclass(frozen=True)
@@ -46,8 +47,9 @@ def move(action: Float[Array, "A 3"], previous: Float[Array, "A 3"], *, rates: R
     """
     pedal, steer = previous[:, 0] - previous[:, 2], previous[:, 1]
     rate = jnp.where(action[:, 0] > 0.0, rates.up_per_s, rates.down_per_s) * action[:, 0]
-    moved = jnp.stack([pedal + rate * action_s, steer + rates.steer_per_s * action_s * action[:, 1]], axis=1)
-    return jnp.concatenate([jnp.clip(moved, -1.0, 1.0), action[:, 2:]], axis=1)
+    pedal = jnp.clip(pedal + rate * action_s, -1.0, rates.most_throttle)
+    steer = jnp.clip(steer + rates.steer_per_s * action_s * action[:, 1], -1.0, 1.0)
+    return jnp.concatenate([jnp.stack([pedal, steer], axis=1), action[:, 2:]], axis=1)
 
 
 def refuse_rates(config: Mapping[str, Any], *, what: str) -> None:

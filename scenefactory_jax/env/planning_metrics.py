@@ -107,11 +107,16 @@ def compute_comfort_parts(velocity: Float[Array, "*a K 2"], yaw: Float[Array, "*
     )
 
 
+def find_violations(parts: ComfortParts) -> Bool[Array, "*a 6"]:
+    """Which bounds are left: lateral acceleration, brakes, longitudinal acceleration, jerk, yaw acceleration, yaw rate."""
+    low, high = LONGITUDINAL
+    left = [parts.lateral > LATERAL, parts.lowest < low, parts.highest > high, parts.jerk > JERK]
+    return jnp.stack([*left, parts.yaw_acceleration > YAW_ACCELERATION, parts.yaw_rate > YAW_RATE], axis=-1)
+
+
 def is_comfortable(parts: ComfortParts) -> Bool[Array, "*a"]:
     """Whether all parts are within their bounds."""
-    low, high = LONGITUDINAL
-    within = (parts.lateral <= LATERAL) & (parts.lowest >= low) & (parts.highest <= high) & (parts.jerk <= JERK)
-    return within & (parts.yaw_acceleration <= YAW_ACCELERATION) & (parts.yaw_rate <= YAW_RATE)
+    return ~jnp.any(find_violations(parts), axis=-1)
 
 
 def compute_comfort(parts: ComfortParts) -> Float[Array, "*a"]:

@@ -85,15 +85,8 @@ def ttc_below(step: RewardInput, *, limit_s: Positive) -> Float[Array, " A"]:
     return (time < limit_s).astype(jnp.float32)
 
 
-@need_history(planning_metrics.COMFORT_ROWS - 1)
-def comfort(step: RewardInput, *, start_row: Annotated[int, Bounds(min=0)]) -> Float[Array, " A"]:
-    """V-Max's continuous comfort over the last second, in (0, 1].
-
-    Where the past is not valid, after a start without a log, the oldest valid state is repeated.
-
-    Args:
-        start_row: row of the log at which episodes begin; the rows before it are the past of a start.
-    """
+def _measure_last_second(step: RewardInput) -> planning_metrics.ComfortParts:
+    """The comfort parts of the agents' last second; where it is not valid, after a start without a log, its oldest valid state repeats."""
     cars, motion, past = len(step.before.active), step.after.motion, step.after.history
     rows = planning_metrics.COMFORT_ROWS - 1
     velocity = jnp.concatenate([motion.velocity[None, :, :2], past.velocity[:rows, :cars]]).swapaxes(0, 1)
@@ -102,10 +95,29 @@ def comfort(step: RewardInput, *, start_row: Annotated[int, Bounds(min=0)]) -> F
     age = jnp.minimum(jnp.arange(rows + 1), jnp.sum(jnp.cumprod(valid, axis=1), axis=1)[:, None] - 1)
     velocity = jnp.take_along_axis(velocity, age[..., None], axis=1)[:, ::-1]
     yaw = jnp.take_along_axis(yaw, age, axis=1)[:, ::-1]
-    return planning_metrics.compute_comfort(planning_metrics.compute_comfort_parts(velocity, yaw, dt=SPACING_S))
+    return planning_metrics.compute_comfort_parts(velocity, yaw, dt=SPACING_S)
+
+
+@need_history(planning_metrics.COMFORT_ROWS - 1)
+def comfort(step: RewardInput, *, start_row: Annotated[int, Bounds(min=0)]) -> Float[Array, " A"]:
+    """V-Max's continuous comfort over the last second, in (0, 1].
+
+    Args:
+        start_row: row of the log at which episodes begin; the rows before it are the past of a start.
+    """
+    return planning_metrics.compute_comfort(_measure_last_second(step))
 
 
 @need_history(planning_metrics.COMFORT_ROWS - 1)
 def discomfort(step: RewardInput, *, start_row: Annotated[int, Bounds(min=0)]) -> Float[Array, " A"]:
     """1 less `comfort`: with a negative weight a price, where comfort's own value would pay for each step of a longer drive."""
     return 1.0 - comfort(step, start_row=start_row)
+
+
+@need_history(planning_metrics.COMFORT_ROWS - 1)
+def comfort_violations(step: RewardInput, *, start_row: Annotated[int, Bounds(min=0)]) -> Float[Array, " A"]:
+    """How many of V-Max's six bounds of comfort the last second leaves.
+
+    `comfort` hardly changes between twice and four times the bound of the jerk, which brakes reach: a price on it teaches little there.
+    """
+    return jnp.sum(planning_metrics.find_violations(_measure_last_second(step)), axis=-1, dtype=jnp.float32)

@@ -68,28 +68,36 @@ def overspeed(step: RewardInput, *, limit_mps: Positive) -> Float[Array, " A"]:
     return jnp.clip(step.metrics.overspeed / limit_mps, 0.0, 1.0)
 
 
-def stop_line_speed(
-    step: RewardInput, *, braking_mps2: Positive, limit_mps: Positive, control_dt: float, late_yellow: bool = False
-) -> Float[Array, " A"]:
+def stop_line_speed(step: RewardInput, *, braking_mps2: Positive, limit_mps: Positive, control_dt: float) -> Float[Array, " A"]:
     """Speed above that from which braking ends at the next line that demands a stop, as a fraction of a limit, clamped to 1.
 
     A line on the agent's route demands a stop while its light is red, and where a stop sign is before which the car has not stood. The
     allowed speed is sqrt(2 b d) at a distance d of the front. 0 without such a line ahead.
-
-    Args:
-        late_yellow: a yellow light demands a stop as well, once it has been yellow for longer than v / 2b: a car that came up at its
-            speed v and is still before the line could have stopped when the light changed.
     """
     state, time_s = step.after, step.after.step.astype(jnp.float32) * control_dt
     lines = route_following.find_stop_lines(step.scene, state.agents, state.route.arc, time_s)
     speed = safe_norm(state.motion.velocity[:, :2])
     demands = lines.red | (lines.stop_sign & ~state.route.stood[:, None])
-    if late_yellow and step.scene.controls.valid.shape[0]:
-        age = traffic_lights.read_light_ages(step.scene.controls, time_s)[lines.control]
-        demands |= traffic_lights.find_yellow(lines.state) & (age > speed[:, None] / (2.0 * braking_mps2))
     room = jnp.min(jnp.where(demands & (lines.distance > 0), lines.distance, jnp.inf), axis=1, initial=jnp.inf)
     excess = speed - jnp.sqrt(2.0 * braking_mps2 * room)
     return jnp.where(route_following.find_routed(step.scene, state.agents), jnp.clip(excess / limit_mps, 0.0, 1.0), 0.0)
+
+
+def late_yellow(step: RewardInput, *, braking_mps2: Positive, control_dt: float) -> Float[Array, " A"]:
+    """1 in the step in which the car's front passes a stop line late at yellow, where it could have stopped.
+
+    Late: the light has been yellow for longer than v / 2b. A car that came up at its speed v was then farther away than v^2 / 2b when the
+    light changed. Cars that only fear the red light go faster at yellow, and some come too late.
+    """
+    state, time_s = step.after, step.after.step.astype(jnp.float32) * control_dt
+    if not step.scene.controls.valid.shape[0]:
+        return jnp.zeros(len(state.active))
+    lines = route_following.find_stop_lines(step.scene, state.agents, state.route.arc, time_s)
+    passed = (lines.distance <= 0) & (lines.distance + (state.route.arc - step.before.route.arc)[:, None] > 0)
+    age = traffic_lights.read_light_ages(step.scene.controls, time_s)[lines.control]
+    late = age > safe_norm(state.motion.velocity[:, :2])[:, None] / (2.0 * braking_mps2)
+    late_passes = jnp.any(passed & traffic_lights.find_yellow(lines.state) & late, axis=1)
+    return (late_passes & route_following.find_routed(step.scene, state.agents)).astype(jnp.float32)
 
 
 def leader_speed(

@@ -29,6 +29,8 @@ STRIDE = 4  # vertices of a lane of which one is looked at first
 MIN_STEP_M = 1e-3  # between vertices of a route
 DRAWS = 64  # of routes that are looked at together
 MAX_CHAINS = 400  # from one root: at the largest junctions chains of later branches are left out
+END_M = 3  # of a track, whose direction is the one at its end
+JOIN_M = 15.0  # of a lane, along which the way that continues a track comes to its line
 
 
 class SampledRoute(NamedTuple):
@@ -82,7 +84,7 @@ def find_track_routes(
     """Finds the routes that a track may have meant, the nearest to the track first.
 
     A track that no chain of lanes follows within `max_distance_m`, and at its end within `max_end_distance_m`, is a route itself, without
-    alternatives. Routes begin at the point nearest to the track's first position.
+    alternatives, and goes on along lanes (`continue_track`). Routes begin at the point nearest to the track's first position.
 
     Args:
         track: valid positions in order; two different ones at least.
@@ -94,13 +96,13 @@ def find_track_routes(
     behind = {root: float(shapely.line_locate_point(lanes.shapes[root], shapely.Point(track[0]))) for root in roots}
     kept = _drop_parts([chain for root in roots for chain in _list_chains(lanes, root, behind[root], max_length_m)])
     if not kept:
-        return [sample_track(track, max_length_m)]
+        return [continue_track(lanes, track, max_length_m)]
     reach = REACH_SLACK_M + float(segment_lengths(track[1:] - track[:-1]).sum())
     offsets = _measure_offsets(lanes, [_cut_chain(lanes, chain, behind[chain[0]] + reach) for chain in kept], track)
     order = sorted(range(len(kept)), key=lambda place: float(offsets[place].sum()))[:count]
     nearest = offsets[order[0]]
     if nearest.max() > max_distance_m or nearest[-1] > max_end_distance_m:
-        return [sample_track(track, max_length_m)]
+        return [continue_track(lanes, track, max_length_m)]
     chosen = [kept[place] for place in order]
     along = [behind[chain[0]] for chain in chosen]
     found = sample_chains(lanes, chosen, *_locate(lanes.graph, [chain[0] for chain in chosen], along), max_length_m)
@@ -219,6 +221,36 @@ def _locate(
     fraction = (at - graph.arc[segment]) / (graph.arc[segment + 1] - graph.arc[segment])
     begin = graph.xyz[segment, :2]
     return begin + fraction[:, None] * (graph.xyz[segment + 1, :2] - begin), behind
+
+
+def continue_track(lanes: LaneMap, track: Float[np.ndarray, "L 2"], max_length_m: float) -> SampledRoute:
+    """A track as a route of its own that goes on along the lane on which the track ends, and from there as straight on as lanes lead.
+
+    It moves over to the lane's line within JOIN_M. A track that ends on no lane, or against it, ends there.
+    """
+    route = sample_track(track, max_length_m)
+    ahead = route.xy[-1] - route.xy[max(len(route.xy) - 1 - END_M, 0)]
+    roots = _find_roots(lanes, track[-1], float(np.arctan2(ahead[1], ahead[0])))
+    left_m = max_length_m - route.length
+    if not roots or left_m < ROUTE_SPACING_M:
+        return route
+    behind = float(shapely.line_locate_point(lanes.shapes[roots[0]], shapely.Point(track[-1])))
+    chain = min(_list_chains(lanes, roots[0], behind, left_m), key=lambda rows: sum(_measure_turn(lanes.graph, row) for row in rows))
+    (tail,) = sample_chains(lanes, [chain], *_locate(lanes.graph, [chain[0]], [behind]), left_m)
+    if tail.length < ROUTE_SPACING_M:
+        return route
+    share = np.maximum(1.0 - ROUTE_SPACING_M * np.arange(len(tail.xy)) / JOIN_M, 0.0)
+    line = np.concatenate([route.xy[:-1], tail.xy + share[:, None] * (track[-1] - tail.xy[0])])
+    lane = np.concatenate([route.lane[:-1], tail.lane])
+    xy, length, nearest = _place_points(line, segment_lengths(line[1:] - line[:-1]), max_length_m)
+    return SampledRoute(xy, lane[nearest], length, chain, on_route=True, along_lanes=False)
+
+
+def _measure_turn(graph: LaneGraph, lane: int) -> float:
+    """The angle in radians between the first and the last segment of a lane."""
+    points = graph.xyz[graph.first[lane] : graph.first[lane + 1], :2]
+    (first, last) = points[1] - points[0], points[-1] - points[-2]
+    return abs(math.atan2(first[0] * last[1] - first[1] * last[0], first @ last))
 
 
 def sample_track(track: Float[np.ndarray, "L 2"], max_length_m: float) -> SampledRoute:

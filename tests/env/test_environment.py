@@ -1,5 +1,6 @@
 """Facts, ends, rewards, observations, spawns and the environment, on a stand-in body that moves as it is told."""
 
+import dataclasses
 import functools
 
 import jax
@@ -623,6 +624,9 @@ def test_rates_move_pedals_and_steering(config):
         applied.append(np.asarray(state.previous_action[0]))
     # pedals_with_reverse keeps the sign of the throttle, and the third number is its brake
     np.testing.assert_allclose(applied, [[0.2, 0.15, 0.7], [-0.3, 0.075, 0.7], [-1.0, 0.075, 0.7], [-1.0, 0.225, 0.7]], atol=1e-6)
+    move = functools.partial(action_settings.move, rates=dataclasses.replace(rates, most_throttle=0.25), action_s=0.1)
+    found = move(jnp.array([[1.0, 0.0, 0.0], [-1.0, 0.0, 0.0]]), jnp.array([[0.2, 0.0, 0.0], [0.0, 0.0, 0.9]]))
+    np.testing.assert_allclose(found[:, 0], [0.25, -1.0], err_msg="full brakes, but not full throttle")
 
 
 def test_planners_and_imitation_refuse_rates():

@@ -12,17 +12,17 @@ from support.planning_scenes import state_of, street
 from scenefactory_jax.cli.hydra_config import load_config
 from scenefactory_jax.core.pytree import replace
 from scenefactory_jax.core.types import ROAD_USERS, RewardInput
-from scenefactory_jax.env import environment, rewards
+from scenefactory_jax.env import environment, planning_metrics, rewards
 
 pytestmark = pytest.mark.usefixtures("quickly")
 LIMIT = 10.0  # m/s on the route
 
 
 @functools.cache
-def program(name, *, control_dt=0.1):
+def program(name, *words):
     """(scene, before, after) -> terms of every car, as the environment computes them."""
     parts = environment.make_parts(
-        load_config("task", "dynamics=bicycle_waymax", "timing=waymax", f"reward={name}", "step_metrics.kernels=false")
+        load_config("task", "dynamics=bicycle_waymax", "timing=waymax", f"reward={name}", "step_metrics.kernels=false", *words)
     )
 
     @jax.jit
@@ -36,8 +36,9 @@ def program(name, *, control_dt=0.1):
     return run
 
 
-def terms(name, *, start=(0.0, 0.0), end=(0.5, 0.0), other=(40.0, 3.0), speed=5.0, yaw=0.0, scene=None, action=(0.0, 0.0, 0.0), **changes):
+def terms(name, *, start=(0.0, 0.0), end=(0.5, 0.0), other=(40.0, 3.0), speed=5.0, yaw=0.0, scene=None, words=(), **changes):
     """The terms of the first car, for a step between two places."""
+    action = changes.pop("action", (0.0, 0.0, 0.0))
     scene = street(starts=(start, other), yaws=(yaw, 0.0)) if scene is None else scene
     before = state_of(scene, speed=(speed, 0.0), past=9)
     before = replace(
@@ -49,7 +50,7 @@ def terms(name, *, start=(0.0, 0.0), end=(0.5, 0.0), other=(40.0, 3.0), speed=5.
     )
     history = changes.pop("history", None)
     after = after if history is None else replace(after, history=history(after.history))
-    return {name: float(value[0]) for name, value in program(name)(scene, before, after).items()}
+    return {name: float(value[0]) for name, value in program(name, *words)(scene, before, after).items()}
 
 
 def test_a_plain_step_is_progress_and_comfort():
@@ -100,6 +101,25 @@ def test_speed_gap_and_comfort_of_the_behaviour_reward():
     assert terms("drive_gentle", history=jolt)["discomfort"] == pytest.approx(-0.2 * fall, rel=1e-5)
     unknown = lambda past: replace(jolt(past), valid=jnp.zeros_like(past.valid))  # noqa: E731
     assert terms("vmax_behaviour", history=unknown)["comfort"] == pytest.approx(0.5, abs=1e-6)
+
+
+def test_each_bound_of_comfort_that_is_left_counts():
+    low, high = planning_metrics.LONGITUDINAL
+    at = [planning_metrics.LATERAL, low, high, planning_metrics.JERK, planning_metrics.YAW_RATE, planning_metrics.YAW_ACCELERATION]
+    at = planning_metrics.ComfortParts(*map(jnp.float32, at))
+    assert not planning_metrics.find_violations(at).any() and planning_metrics.is_comfortable(at)
+    columns = []
+    for name in at._fields:
+        over = at._replace(**{name: getattr(at, name) * 1.01})
+        columns += np.flatnonzero(planning_metrics.find_violations(over)).tolist()
+        assert not planning_metrics.is_comfortable(over)
+    assert sorted(columns) == list(range(6))
+    price = "{_target_: scenefactory_jax.env.planning_rewards.comfort_violations, weight: -0.5, start_row: 0}"
+    found = functools.partial(terms, "drive_gentle", words=(f"+reward.violations={price}",))
+    assert found()["violations"] == 0
+    faster = lambda past: replace(past, velocity=past.velocity.at[0, :, 0].add(2.0))  # noqa: E731
+    # 7 m/s in the state before this one, else 5: a slope of up to 4 m/s^2 over five states, and its jerk; brakes of 4.05 m/s^2 are allowed
+    assert found(history=faster)["violations"] == pytest.approx(-1.0)
 
 
 def test_metadrive_by_hand():

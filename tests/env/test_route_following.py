@@ -107,15 +107,14 @@ def test_a_stop_sign_asks_for_standing_before_it(glide):
 
 
 def test_speed_before_lines_that_demand_a_stop(env):
-    """Fronts 8 m before the line, that of the last red one behind it: braking of 4 m/s^2 stops from 8 m/s. Yellow for 1.5 s."""
-    sign, red, green, yellow = range(4)
+    """Fronts 8 m before the line, that of the last one behind it: braking of 4 m/s^2 stops from 8 m/s."""
+    sign, red, green = range(3)
     cases = [  # control, speed, start, whether the car has stood, the term
         (sign, 7.9, 0.0, False, 0.0), (sign, 10.0, 0.0, False, 0.5), (sign, 20.0, 0.0, False, 1.0), (sign, 20.0, 0.0, True, 0.0),
         (red, 7.9, 0.0, False, 0.0), (red, 10.0, 0.0, True, 0.5), (green, 20.0, 0.0, False, 0.0), (red, 20.0, 9.0, False, 0.0),
-        (yellow, 7.9, 0.0, False, 0.0), (yellow, 10.0, 0.0, False, 0.5), (yellow, 12.5, 0.0, False, 0.0),
     ]  # fmt: skip
     control, speeds, starts, stood, expected = zip(*cases, strict=True)
-    controls = [((-40.0, 0.0), changes, np.inf) for changes in (None, [(0.0, STOP)], [(0.0, GO)], [(-1.5, CAUTION)])]
+    controls = [((-40.0, 0.0), changes, np.inf) for changes in (None, [(0.0, STOP)], [(0.0, GO)])]
     lines = [STRAIGHT + np.array([0.0, 5.0 * row]) for row in range(len(cases))]
     scene = routed_scene(lines, starts=starts, speeds=speeds, controls=controls, stops=[[(10.0, which)] for which in control])
     state = env.reset(jax.random.key(0), scene)[0]
@@ -123,9 +122,23 @@ def test_speed_before_lines_that_demand_a_stop(env):
     result = jax.jit(env.step)(scene, state, action)[1]
     step = RewardInput(scene, state, action, state, result.metrics, result.events)
     term = functools.partial(rewards.stop_line_speed, braking_mps2=4.0, limit_mps=4.0, control_dt=1 / 30)
-    np.testing.assert_allclose(jax.jit(functools.partial(term, late_yellow=True))(step), expected, atol=1e-5)
-    before = np.where(np.array(control) == yellow, 0.0, expected)
-    np.testing.assert_allclose(jax.jit(term)(step), before, atol=1e-5)
+    np.testing.assert_allclose(jax.jit(term)(step), expected, atol=1e-5)
+
+
+def test_a_line_is_passed_late_at_yellow(env):
+    """Fronts 0.1 m before the line; lights yellow for 1.5 s and 0.5 s. By 4 m/s^2 a car of 11 m/s could have stopped 1.375 s ago."""
+    old, new, red = range(3)
+    cases = [(old, 11.0, 1.0), (old, 13.0, 0.0), (new, 11.0, 0.0), (new, 3.5, 1.0), (red, 11.0, 0.0), (old, 2.0, 0.0)]
+    control, speeds, expected = zip(*cases, strict=True)
+    controls = [((-40.0, 0.0), [(since, state)], np.inf) for since, state in ((-1.5, CAUTION), (-0.5, CAUTION), (-1.5, STOP))]
+    lines = [STRAIGHT + np.array([0.0, 5.0 * row]) for row in range(len(cases))]
+    scene = routed_scene(lines, speeds=speeds, controls=controls, stops=[[(2.1, which)] for which in control])
+    before, action = env.reset(jax.random.key(0), scene)[0], jnp.zeros((len(cases), 3))
+    after, result = jax.jit(env.step)(scene, before, action)
+    term = functools.partial(rewards.late_yellow, braking_mps2=4.0, control_dt=1 / 30)
+    np.testing.assert_array_equal(jax.jit(term)(RewardInput(scene, before, action, after, result.metrics, result.events)), expected)
+    assert not np.any(jax.jit(term)(RewardInput(scene, after, action, after, result.metrics, result.events))), "passed before"
+
 
 
 def test_lights_follow_their_changes_and_periods():

@@ -76,10 +76,24 @@ def test_a_track_that_ends_in_another_lane_is_a_route_itself(fork):
     ends = {"max_end_distance_m": 2.0}
     assert route_sets.find_track_routes(fork, change, 0.0, count=1, **LIMITS)[0].along_lanes
     (route,) = route_sets.find_track_routes(fork, change, 0.0, count=1, **LIMITS, **ends)
-    assert not route.along_lanes
-    np.testing.assert_allclose(route.xy[-1], change[-1], atol=1e-9)
+    assert not route.along_lanes and names(fork, route) == [15]
     further = np.append(change, line((80, 1.9), (120, 1.9), 5.0), axis=0)  # it comes back
     assert route_sets.find_track_routes(fork, further, 0.0, count=1, **LIMITS, **ends)[0].along_lanes
+
+
+def test_a_track_of_its_own_goes_on_along_the_lane_on_which_it_ends(fork):
+    """From (75, 2.4) over 15 m to the line of the lane 15, at y = 3.6; a track that ends before the fork goes straight on behind it."""
+    change = np.stack([np.linspace(5, 75, 15), np.linspace(0, 2.4, 15)], axis=1)
+    route = route_sets.continue_track(fork, change, 300.0)
+    assert route.on_route and not route.along_lanes and names(fork, route) == [15]
+    np.testing.assert_allclose(route.xy[-1], [140.0, 3.6], atol=1e-6)
+    np.testing.assert_allclose(np.interp([75, 80, 85, 90, 95], *route.xy.T), [2.4, 2.8, 3.2, 3.6, 3.6], atol=0.05)
+    assert (route.lane[:70] == -1).all() and set(fork.graph.id[route.lane[72:]]) == {15}
+    assert route.length == pytest.approx(np.hypot(70, 2.4) + 65, abs=0.1)
+    assert names(fork, route_sets.continue_track(fork, line((5, 1), (30, 1), 5.0), 300.0)) == [10, 11, 14]
+    assert route_sets.continue_track(fork, change, 75.0).length == 75.0
+    against = route_sets.continue_track(fork, change[::-1], 300.0)
+    assert against.lanes == () and (against.lane == -1).all()
 
 
 def test_a_loop_that_comes_back_to_the_track_is_no_route_of_it():

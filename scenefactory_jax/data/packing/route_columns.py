@@ -203,9 +203,9 @@ def _find_lanes(
     lane, limit = np.full((len(found), points), -1), np.full((len(found), points), np.inf)
     known = np.array([np.inf if (line := raw.roads[index].speed_limit) is None else line for index in index_of_lane], float)
     for row, route in enumerate(found):
-        if route.along_lanes:
-            rows = np.append(route.lane, np.full(points - len(route.lane), route.lane[-1]))
-            lane[row], limit[row] = index_of_lane[rows], known[rows]
+        rows = np.append(route.lane, np.full(points - len(route.lane), route.lane[-1]))
+        on = rows >= 0
+        lane[row, on], limit[row, on] = index_of_lane[rows[on]], known[rows[on]]
     return {"routes.lane": lane, "routes.speed_limit": limit}
 
 
