@@ -39,13 +39,22 @@ def parse_runs(words: Sequence[str]) -> dict[str, list[str]]:
 def evaluate(asked: Asked, kept: Path) -> statistics.Runs:
     """Evaluates, or reads what an earlier call with the same words measured; number of the run -> records."""
     request = {"versions": run_config.versions(), **asked._asdict()}
-    folder = kept / result_file.digest(asked._asdict())
+    folder = _find_folder(asked, kept)
     if not (folder / REQUEST).is_file():
         folder.mkdir(parents=True, exist_ok=True)
         for number, table in enumerate(_measure(asked)):
             records.write_records(folder / f"run-{number}.csv", table, metadata=request)
         result_file.write(folder / REQUEST, request, digits=None)  # last: it says that the tables are whole
     return {number: records.read_records(folder / f"run-{number}.csv") for number in range(max(len(asked.runs), 1))}
+
+
+def find_device(asked: Asked, kept: Path) -> str:
+    """Reads on which device `evaluate` measured."""
+    return result_file.read(_find_folder(asked, kept) / REQUEST)["versions"]["device"]
+
+
+def _find_folder(asked: Asked, kept: Path) -> Path:
+    return kept / result_file.digest(asked._asdict())
 
 
 def compose(asked: Asked) -> tuple[dict[str, Any], dict[str, Any]]:

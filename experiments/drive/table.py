@@ -5,11 +5,12 @@ python -m experiments.drive.table --scenes womd_test=BANK womd_links_test=BANK t
 
 Runs of one name are its seeds, evaluated by one program: brackets are 95 % intervals over seeds, scenes and agents, of planners over
 scenes. What an earlier call measured is kept in `--kept` and read again, so that a stopped call goes on, and new runs cost only themselves.
-Writes `table.md` and `table.json`.
+Writes `table.md` and `table.json`; what an earlier call has written there stays, so that drivers and rows may be measured one by one.
 """
 
 import argparse
 import time
+from collections import Counter
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -26,6 +27,7 @@ from scenefactory_jax.evaluation.records import Records, select_rows
 
 HERE = Path(__file__).parent
 TOWNS = ("scenes.heldout.path=null", "scenes.heldout.seed=2000000", "scenes.heldout.count=64")  # as in experiments/suites
+LANES = ("scenes/pack/routes=lanes",)  # a planner that follows a route has none in these protocols, and policies bring their own
 BEYOND = ("observations.route.beyond_goal=true", "+observations.ego.beyond_goal=true")  # these episodes go on behind the goal
 AMONG = ("traffic=log_playback", "scenes.pack.traffic=64")
 PLANNERS = ("log", "pure_pursuit", "route_pursuit", "idm_route", "pdm_closed")
@@ -49,7 +51,8 @@ class Row(NamedTuple):
     overrides: tuple[str, ...]
     numbers: tuple[Number, ...]
     has_log: bool = True
-    of_runs: tuple[str, ...] = ()  # further overrides of runs; those of planners are in `conf/protocol`
+    of_runs: tuple[str, ...] = ()  # further overrides of runs
+    of_planners: tuple[str, ...] = ()  # and of planners, beside those in `conf/protocol`
 
 
 def count_events(records: Records) -> dict[str, np.ndarray]:
@@ -79,13 +82,15 @@ ROWS = {
         Number("of agents whose recorded driver does so", "clean_success_rate", "", if_recorded=True),
         Number("the same on bends", "clean_bend_rate", ">= 92 %"),
         Number("events in all (collision, edge, tip-over)", "collision_rate", "<= 0.8 %", count_events),
-    )),
+    ), of_planners=LANES),
     "among": Row(("protocol=strict",), AMONG, (
         Number("`strict` among played-back traffic: clean", "clean_success_rate", ">= 94 %"),
         Number("of agents whose recorded driver is: clean", "clean_success_rate", "", if_recorded=True),
         Number("the same: collisions", "collision_rate", "<= 3 %"),
-    )),
-    "paper": Row(("protocol=paper",), (), (Number("from rest (`paper`): collisions", "collision_rate", "<= 1 %"),), has_log=False),
+    ), of_planners=LANES),
+    "paper": Row(("protocol=paper",), (), (
+        Number("from rest (`paper`): collisions", "collision_rate", "<= 1 %"),
+    ), has_log=False, of_planners=LANES),
     "route100": Row(("protocol=route100",), (), (
         Number("`route100`: clean completion", "clean_completion_rate", ">= 90 %"),
         Number("`route100`: collisions per 100 km", "collisions_per_100_km", "<= 5"),
@@ -109,9 +114,10 @@ ROWS = {
 def measure(row: Row, runs: tuple[str, ...], planner: str | None, scenes: str, given: argparse.Namespace) -> dict[str, Any]:
     """Measures the numbers of a row: label -> estimate; a number that nothing has is left out, and without recorded drivers what needs
     them."""
-    found, numbers = _evaluate(row, runs, planner, scenes, given), {}
+    asked, numbers = _ask(row, runs, planner, scenes, given), {}
+    found, device = evaluations.evaluate(asked, given.kept), evaluations.find_device(asked, given.kept)
     needed = RECORDED in given.planners and any(number.if_recorded for number in row.numbers)
-    recorded = _evaluate(row, (), RECORDED, scenes, given)[0] if needed else None
+    recorded = evaluations.evaluate(_ask(row, (), RECORDED, scenes, given), given.kept)[0] if needed else None
     for number in row.numbers:
         if number.if_recorded and recorded is None:
             continue
@@ -119,38 +125,45 @@ def measure(row: Row, runs: tuple[str, ...], planner: str | None, scenes: str, g
         chosen = {seed: number.select(records) for seed, records in possible.items()}
         summarise = statistics.summarise_runs if len(chosen) > 1 else lambda runs, **how: statistics.summarise(runs[0], **how)
         if len(chosen[0]["scene"]) and number.metric in (estimates := summarise(chosen, bootstrap=given.bootstrap, seed=0)):
-            numbers[number.label] = estimates[number.metric]._asdict() | {"runs": len(chosen)}
+            numbers[number.label] = estimates[number.metric]._asdict() | {"runs": len(chosen), "device": device}
     return numbers
 
 
-def _evaluate(row: Row, runs: tuple[str, ...], planner: str | None, scenes: str, given: argparse.Namespace) -> statistics.Runs:
+def _ask(row: Row, runs: tuple[str, ...], planner: str | None, scenes: str, given: argparse.Namespace) -> Asked:
     towns = TOWNS if scenes == "null" else ()
-    overrides = (*row.overrides, *(() if planner else row.of_runs), *towns, *given.overrides)
-    return evaluations.evaluate(Asked(runs, planner, row.protocol, overrides, None if scenes == "null" else scenes), given.kept)
+    overrides = (*row.overrides, *(row.of_planners if planner else row.of_runs), *towns, *given.overrides)
+    return Asked(runs, planner, row.protocol, overrides, None if scenes == "null" else scenes)
 
 
 def write_report(result: Mapping[str, Any], path: Path) -> Path:
-    """Writes one table a set of scenes: lines are the targets, columns who drives."""
-    about = "One episode a scene; brackets are 95 % intervals, over seeds, scenes and agents for several runs, else over scenes."
-    lines = ["# Targets", "", about, ""]
+    """Writes one table a set of scenes: lines are the targets, columns who drives; numbers of all devices but the most frequent are
+    marked."""
+    cells = [cell for drivers in result["sets"].values() for numbers in drivers.values() for cell in numbers.values()]
+    devices = [device for device, _ in Counter(cell["device"] for cell in cells).most_common()]
+    marks = {device: "*" * number for number, device in enumerate(devices)}
+    about = ["One episode a scene; brackets are 95 % intervals, over seeds, scenes and agents for several runs, else over scenes."]
+    about += [f"Measured on {'; '.join(f'{marks[device]} {device}'.strip() for device in devices)}."] if devices else []
+    lines = ["# Targets", "", " ".join(about).replace("*", r"\*"), ""]
     for name, drivers in result["sets"].items():
+        columns = {driver: drivers[driver] for driver in (*PLANNERS, *sorted(set(drivers) - set(PLANNERS))) if driver in drivers}
         rows = []
         for row in ROWS.values():
             for number in row.numbers:
-                cells = [_format(estimates.get(number.label)) for estimates in drivers.values()]
-                rows += [[number.label, number.aim, *cells]] if any(cells) else []
-        header = ["", "aim", *(f"{driver} ({count} runs)" if (count := result["runs"].get(driver)) else driver for driver in drivers)]
+                shown = [_format(numbers.get(number.label), marks) for numbers in columns.values()]
+                rows += [[number.label, number.aim, *shown]] if any(shown) else []
+        header = ["", "aim", *(f"{driver} ({count} runs)" if (count := result["runs"].get(driver)) else driver for driver in columns)]
         lines += [f"## {name}", "", markdown.format_table(header, rows), ""]
-    path.write_text("\n".join([*lines, f"`{result['command']}`", ""]))
+    path.write_text("\n".join([*lines, *(f"`{command}`\n" for command in result["commands"])]))
     return path
 
 
-def _format(estimate: Mapping[str, Any] | None) -> str:
+def _format(estimate: Mapping[str, Any] | None, marks: Mapping[str, str]) -> str:
     if estimate is None or estimate["value"] is None:
         return ""
     scale, digits, unit = (100.0, 1, " %") if estimate["unit"] == "fraction" else (1.0, 2, "")
     show = lambda value: f"{scale * value:.{digits}f}"  # noqa: E731
-    return show(estimate["value"]) + unit + ("" if estimate["low"] is None else f" [{show(estimate['low'])}, {show(estimate['high'])}]")
+    interval = "" if estimate["low"] is None else f" [{show(estimate['low'])}, {show(estimate['high'])}]"
+    return show(estimate["value"]) + unit + interval + marks[estimate["device"]].replace("*", r"\*")
 
 
 def main() -> None:
@@ -170,17 +183,20 @@ def main() -> None:
     runs = {name: tuple(folders) for name, folders in evaluations.parse_runs(given.runs).items()}
     drivers = {**{planner: ((), planner) for planner in given.planners}, **{name: (folders, None) for name, folders in runs.items()}}
     command = " ".join(["python -m experiments.drive.table --runs", *given.runs, "--scenes", *given.scenes, "--planners", *given.planners])
-    result: dict[str, Any] = {"command": command, "runs": {name: len(folders) for name, folders in runs.items()}, "sets": {}}
-    for name, (path,) in evaluations.parse_runs(given.scenes).items():
+    path = given.out / "table.json"
+    result: dict[str, Any] = result_file.read(path) if path.exists() else {"commands": [], "runs": {}, "sets": {}}
+    result["commands"] += [command] if command not in result["commands"] else []
+    result["runs"] |= {name: len(folders) for name, folders in runs.items()}
+    for name, (scenes,) in evaluations.parse_runs(given.scenes).items():
         for row_name in given.rows:
             for driver, (folders, planner) in drivers.items():
                 before, row = time.monotonic(), ROWS[row_name]
                 kept = result["sets"].setdefault(name, {}).setdefault(driver, {})
                 if planner != RECORDED or row.has_log:
-                    kept.update(measure(row, folders, planner, path, given))
+                    kept.update(measure(row, folders, planner, scenes, given))
                     print(f"{name}, {row_name}, {driver}: {time.monotonic() - before:.0f} s", flush=True)
-            result_file.write(given.out / "table.json", result | {"versions": run_config.versions()}, digits=5)
-            write_report(result_file.read(given.out / "table.json"), given.out / "table.md")
+            result_file.write(path, result | {"versions": run_config.versions()}, digits=5)
+            write_report(result_file.read(path), given.out / "table.md")
     print(given.out / "table.md")
 
 

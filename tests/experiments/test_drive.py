@@ -106,12 +106,13 @@ def test_every_row_asks_for_episodes_that_there_are(name):
     assert config["observations"]["route"]["beyond_goal"] == (found["protocol"]["termination"][-1] == "whole")
     assert config["traffic"]["_target_"] == ("log_traffic" if name == "among" else config["traffic"]["_target_"])
     assert {number.metric for number in row.numbers} <= set(METRICS)
-    planned, _ = evaluations.compose(Asked((), "idm_route", row.protocol, (*row.overrides, *table.TOWNS), None))
+    planned, _ = evaluations.compose(Asked((), "idm_route", row.protocol, (*row.overrides, *row.of_planners, *table.TOWNS), None))
+    assert planned["scenes"]["pack"]["routes"], "a planner without a route does not move"
     assert planned["policy"]["_target_"].endswith("idm_route.make") and planned["scenes"]["heldout"]["count"] == 64
 
 
 def test_the_table_has_what_was_measured_once(tmp_path, monkeypatch):
-    """Two runs and a planner: rates, events of any kind, u = 0.8 alone; a second call evaluates nothing."""
+    """Two runs and a planner: rates, events of any kind, u = 0.8 alone; again nothing is evaluated, and other rows keep these."""
     calls = []
 
     def make_evaluator(config, scenes, **settings):
@@ -137,6 +138,12 @@ def test_the_table_has_what_was_measured_once(tmp_path, monkeypatch):
     assert "| aim | log | ours (2 runs) |" in text and "| `grip`: clean at u = 0.8, mu 0.3 | >= 80 % |  | 100.0 %" in text
     table.main()
     assert len(calls) == 3
+    arguments = ["table", "--scenes", "towns=null", "--planners", "idm_route", "--rows", "paper", "--bootstrap", "50"]
+    monkeypatch.setattr("sys.argv", [*arguments, "--kept", str(tmp_path / "kept"), "--out", str(tmp_path)])
+    table.main()
+    assert len(calls) == 4
+    assert result_file.read(tmp_path / "table.json")["sets"]["towns"]["ours"] == found["ours"]
+    assert "| aim | log | idm_route | ours (2 runs) |" in (tmp_path / "table.md").read_text()
 
 
 # ---- cross-play
