@@ -95,6 +95,7 @@ ROWS = {
         Number("`route100`: clean completion", "clean_completion_rate", ">= 90 %"),
         Number("`route100`: collisions per 100 km", "collisions_per_100_km", "<= 5"),
         Number("`route100`: red lights run, of approaches", "red_light_per_approach", "<= 0.5 %"),
+        Number("`route100`: red lights run with room to stop", "avoidable_red_light_per_approach", "<= 0.5 %"),
     ), has_log=False),
     **{f"grip_{mu:g}": _make_grip(mu, aim) for mu, aim in ((1.0, ">= 90 %"), (0.6, ">= 90 %"), (0.3, ">= 80 %"), (0.15, ">= 60 %"))},
     "conflict": Row(("protocol=conflict",), (), (
@@ -107,6 +108,7 @@ ROWS = {
     "nuplan": Row(("protocol=nuplan",), (), (Number("nuPlan score", "nuplan_score", ">= 0.90"),), of_runs=BEYOND),
     "recorded_routes": Row(("protocol=recorded_routes",), (), (
         Number("`recorded_routes`: red lights run, of approaches", "red_light_per_approach", "<= 0.5 %"),
+        Number("`recorded_routes`: red lights run with room to stop", "avoidable_red_light_per_approach", "<= 0.5 %"),
     )),
 }  # fmt: skip
 

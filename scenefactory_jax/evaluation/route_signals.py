@@ -3,7 +3,9 @@
 A clean completion (suite `route100`): the car passes gates every 20 m along its route, 2.5 m to either side, and the last one, at the goal,
 within 30 degrees of the route's direction, in 10 s and a second for every 4 m of the route; it has no other event, and drives the wrong way
 for one second at most. Time does not count while the car stands and the next stop line on its route, up to 50 m ahead, has a red light.
-An approach to a red light begins when that line comes within 50 m or turns red there.
+An approach to a red light begins when that line comes within 50 m or turns red there. A red light that a car runs counts as avoidable if at
+some step of its last approach the light was yellow or red and the car farther away than v^2 / 2b: recorded cars may start at a red line at
+speed.
 """
 
 from dataclasses import dataclass
@@ -17,6 +19,7 @@ from scenefactory_jax.core.pytree import pytree_dataclass
 from scenefactory_jax.core.schema import Bounds, NonNegative, Positive
 from scenefactory_jax.core.types import Scene, State, StepMetrics
 from scenefactory_jax.env.observations.planning import read_stop_lines
+from scenefactory_jax.env.traffic import idm_law
 from scenefactory_jax.evaluation.records import EVENTS, Records
 
 
@@ -31,6 +34,7 @@ class CourseThresholds:
     speed_mps: Positive
     queue_m: NonNegative  # before a red light, in which the time limit does not run for a car that stands
     stand_mps: NonNegative  # a slower car stands
+    stop_braking_mps2: Positive  # a red light is avoidable for a car that could have stopped with it
     wrong_way_s: NonNegative
 
 
@@ -43,6 +47,8 @@ class RouteSignals:
     red_steps: Int[Array, " A"]  # waiting for a red light
     red_ahead: Bool[Array, " A"]  # the next stop line, near ahead, has a red light
     red_approaches: Int[Array, " A"]  # how often that began
+    could_stop: Bool[Array, " A"]  # the next stop line's light is yellow or red, and there was room to stop since it is
+    avoidable_reds: Int[Array, " A"]  # red lights run that could have been stopped at
     completion: Float[Array, " A"]  # part of the route, 0 to 1
     goal_alignment: Float[Array, " A"]  # cosine between car and route in the last step
     driven: Float[Array, " A"]  # m
@@ -51,8 +57,8 @@ class RouteSignals:
 
 def begin_signals(state: State) -> RouteSignals:
     """Returns the signals at the start of an episode."""
-    zero, none = jnp.zeros(state.active.shape, jnp.float32), jnp.zeros(state.active.shape, jnp.int32)
-    return RouteSignals(none, none, none, jnp.zeros(state.active.shape, bool), none, zero, zero, zero, zero)
+    zero, none, no = (jnp.zeros(state.active.shape, dtype) for dtype in (jnp.float32, jnp.int32, bool))
+    return RouteSignals(none, none, none, no, none, no, none, zero, zero, zero, zero)
 
 
 def update_signals(
@@ -67,7 +73,12 @@ def update_signals(
     at_goal = metrics.events.goal_reached
     lines = read_stop_lines(scene, after, after.step.astype(jnp.float32) * control_dt)
     nearest = jnp.min(lines.distance, axis=1, keepdims=True, initial=course.queue_m)
-    red = jnp.any(lines.red & (lines.distance <= nearest), axis=1)
+    is_next = lines.distance <= nearest
+    red = jnp.any(lines.red & is_next, axis=1)
+    stops = idm_law.can_stop(metrics.speed[:, None], lines.distance, course.stop_braking_mps2)
+    room = jnp.any((lines.red | lines.yellow) & is_next & stops, axis=1)
+    closed = jnp.any((lines.red | lines.yellow) & is_next, axis=1)
+    runs = routed & metrics.events.red_light
     begins = routed & red & ~signals.red_ahead
     missed = routed & (passes | at_goal) & (metrics.route_distance > course.gate_half_width_m)
     return RouteSignals(
@@ -76,6 +87,8 @@ def update_signals(
         red_steps=signals.red_steps + (routed & red & (metrics.speed < course.stand_mps)).astype(jnp.int32),
         red_ahead=red,
         red_approaches=signals.red_approaches + begins.astype(jnp.int32),
+        could_stop=room | (closed & signals.could_stop & ~runs),
+        avoidable_reds=signals.avoidable_reds + (runs & signals.could_stop).astype(jnp.int32),
         completion=jnp.where(routed, metrics.route_completion, signals.completion),
         goal_alignment=jnp.where(routed, metrics.route_alignment, signals.goal_alignment),
         driven=signals.driven + jnp.where(active, metrics.speed * control_dt, 0.0),
@@ -102,6 +115,7 @@ def make_columns(signals: RouteSignals, records: Records, *, course: CourseThres
         "against_s": wrong_way_s,
         "red_light_wait_s": red_s,
         "red_light_approaches": np.asarray(signals.red_approaches),
+        "red_light_avoidable": np.asarray(signals.avoidable_reds) > 0,
         "driven_m": np.asarray(signals.driven),
         "max_overspeed_mps": np.asarray(signals.overspeed),
         "clean_completion": clean & records["has_route"],

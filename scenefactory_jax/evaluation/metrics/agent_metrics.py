@@ -11,7 +11,7 @@ from scenefactory_jax.evaluation.records import EVENTS, Records
 HIGH_DRAC = 3.4  # m/s^2; comfortable deceleration in AASHTO's design guide, and the threshold of the published evaluation
 NEAR_MISS_TTC = 2.0  # s
 MAX_TTC = 10.0  # s
-APPROACHES = "red_light_approaches"  # tables of before there was this metric lack the column
+APPROACHES, AVOIDABLE = "red_light_approaches", "red_light_avoidable"  # tables of before there were these metrics lack the columns
 BEND = 1.05  # length of a route over the straight line to its goal
 
 
@@ -109,6 +109,11 @@ METRICS: dict[str, Metric] = {
     "red_light_per_approach": Metric(
         "Red lights run, of approaches", FRACTION, "Red lights run, of those that an agent with a route came within 50 m of.",
         _column("red_light"), lambda records: np.asarray(_has_route(records), bool) & (APPROACHES in records),
+        weight=lambda records: np.maximum(_on_route(APPROACHES)(records), records["red_light"]), optional=True),
+    "avoidable_red_light_per_approach": Metric(
+        "Red lights run with room to stop", FRACTION, "Red lights run that had been yellow or red while the car could stop with 3 m/s², of "
+        "those that an agent with a route came within 50 m of.",
+        lambda records: _on_route(AVOIDABLE)(records), lambda records: np.asarray(_has_route(records), bool) & (AVOIDABLE in records),
         weight=lambda records: np.maximum(_on_route(APPROACHES)(records), records["red_light"]), optional=True),
     "stop_sign_rate": _rate(
         "Stop signs run", "Agents whose front passed the line of a stop sign without having stood before it, of the agents with a route.",
