@@ -19,6 +19,7 @@ class Rates:
     down_per_s: Positive
     steer_per_s: Positive
     most_throttle: Fraction = 1.0
+    exponent: Positive = 1.0  # of the size of a number: above 1 small numbers move little, and so does the noise about them
 
 
 @dataclasses.dataclass(frozen=True)
@@ -46,9 +47,10 @@ def move(action: Float[Array, "A 3"], previous: Float[Array, "A 3"], *, rates: R
         action_s: between two actions.
     """
     pedal, steer = previous[:, 0] - previous[:, 2], previous[:, 1]
-    rate = jnp.where(action[:, 0] > 0.0, rates.up_per_s, rates.down_per_s) * action[:, 0]
+    number = action if rates.exponent == 1.0 else jnp.sign(action) * jnp.abs(action) ** rates.exponent
+    rate = jnp.where(number[:, 0] > 0.0, rates.up_per_s, rates.down_per_s) * number[:, 0]
     pedal = jnp.clip(pedal + rate * action_s, -1.0, rates.most_throttle)
-    steer = jnp.clip(steer + rates.steer_per_s * action_s * action[:, 1], -1.0, 1.0)
+    steer = jnp.clip(steer + rates.steer_per_s * action_s * number[:, 1], -1.0, 1.0)
     return jnp.concatenate([jnp.stack([pedal, steer], axis=1), action[:, 2:]], axis=1)
 
 

@@ -627,6 +627,9 @@ def test_rates_move_pedals_and_steering(config):
     move = functools.partial(action_settings.move, rates=dataclasses.replace(rates, most_throttle=0.25), action_s=0.1)
     found = move(jnp.array([[1.0, 0.0, 0.0], [-1.0, 0.0, 0.0]]), jnp.array([[0.2, 0.0, 0.0], [0.0, 0.0, 0.9]]))
     np.testing.assert_allclose(found[:, 0], [0.25, -1.0], err_msg="full brakes, but not full throttle")
+    move = functools.partial(action_settings.move, rates=dataclasses.replace(rates, exponent=2.0), action_s=0.1)
+    found = move(jnp.array([[0.5, -1.0, 0.3], [-0.5, 0.2, 0.3]]), jnp.zeros((2, 3)))
+    np.testing.assert_allclose(found, [[0.05, -0.15, 0.3], [-0.1, 0.006, 0.3]], atol=1e-6)
 
 
 def test_planners_and_imitation_refuse_rates():
