@@ -142,10 +142,10 @@ def write_report(result: Mapping[str, Any], path: Path) -> Path:
     marked."""
     cells = [cell for drivers in result["sets"].values() for numbers in drivers.values() for cell in numbers.values()]
     devices = [device for device, _ in Counter(cell["device"] for cell in cells).most_common()]
-    marks = {device: "*" * number for number, device in enumerate(devices)}
+    marks = {device: r"\*" * number for number, device in enumerate(devices)}
     about = ["One episode a scene; brackets are 95 % intervals, over seeds, scenes and agents for several runs, else over scenes."]
     about += [f"Measured on {'; '.join(f'{marks[device]} {device}'.strip() for device in devices)}."] if devices else []
-    lines = ["# Targets", "", " ".join(about).replace("*", r"\*"), ""]
+    lines = ["# Targets", "", " ".join(about), ""]
     for name, drivers in result["sets"].items():
         columns = {driver: drivers[driver] for driver in (*PLANNERS, *sorted(set(drivers) - set(PLANNERS))) if driver in drivers}
         rows = []
@@ -165,7 +165,7 @@ def _format(estimate: Mapping[str, Any] | None, marks: Mapping[str, str]) -> str
     scale, digits, unit = (100.0, 1, " %") if estimate["unit"] == "fraction" else (1.0, 2, "")
     show = lambda value: f"{scale * value:.{digits}f}"  # noqa: E731
     interval = "" if estimate["low"] is None else f" [{show(estimate['low'])}, {show(estimate['high'])}]"
-    return show(estimate["value"]) + unit + interval + marks[estimate["device"]].replace("*", r"\*")
+    return show(estimate["value"]) + unit + interval + marks[estimate["device"]]
 
 
 def main() -> None:

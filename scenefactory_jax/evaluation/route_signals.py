@@ -48,7 +48,7 @@ class RouteSignals:
     red_ahead: Bool[Array, " A"]  # the next stop line, near ahead, has a red light
     red_approaches: Int[Array, " A"]  # how often that began
     could_stop: Bool[Array, " A"]  # the next stop line's light is yellow or red, and there was room to stop since it is
-    avoidable_reds: Int[Array, " A"]  # red lights run that could have been stopped at
+    ran_avoidable: Bool[Array, " A"]  # a red light that could have been stopped at
     completion: Float[Array, " A"]  # part of the route, 0 to 1
     goal_alignment: Float[Array, " A"]  # cosine between car and route in the last step
     driven: Float[Array, " A"]  # m
@@ -58,7 +58,7 @@ class RouteSignals:
 def begin_signals(state: State) -> RouteSignals:
     """Returns the signals at the start of an episode."""
     zero, none, no = (jnp.zeros(state.active.shape, dtype) for dtype in (jnp.float32, jnp.int32, bool))
-    return RouteSignals(none, none, none, no, none, no, none, zero, zero, zero, zero)
+    return RouteSignals(none, none, none, no, none, no, no, zero, zero, zero, zero)
 
 
 def update_signals(
@@ -75,9 +75,8 @@ def update_signals(
     nearest = jnp.min(lines.distance, axis=1, keepdims=True, initial=course.queue_m)
     is_next = lines.distance <= nearest
     red = jnp.any(lines.red & is_next, axis=1)
-    stops = idm_law.can_stop(metrics.speed[:, None], lines.distance, course.stop_braking_mps2)
-    room = jnp.any((lines.red | lines.yellow) & is_next & stops, axis=1)
-    closed = jnp.any((lines.red | lines.yellow) & is_next, axis=1)
+    closed = (lines.red | lines.yellow) & is_next
+    room = closed & idm_law.can_stop(metrics.speed[:, None], lines.distance, course.stop_braking_mps2)
     runs = routed & metrics.events.red_light
     begins = routed & red & ~signals.red_ahead
     missed = routed & (passes | at_goal) & (metrics.route_distance > course.gate_half_width_m)
@@ -87,8 +86,8 @@ def update_signals(
         red_steps=signals.red_steps + (routed & red & (metrics.speed < course.stand_mps)).astype(jnp.int32),
         red_ahead=red,
         red_approaches=signals.red_approaches + begins.astype(jnp.int32),
-        could_stop=room | (closed & signals.could_stop & ~runs),
-        avoidable_reds=signals.avoidable_reds + (runs & signals.could_stop).astype(jnp.int32),
+        could_stop=jnp.any(room, axis=1) | (jnp.any(closed, axis=1) & signals.could_stop & ~runs),
+        ran_avoidable=signals.ran_avoidable | (runs & signals.could_stop),
         completion=jnp.where(routed, metrics.route_completion, signals.completion),
         goal_alignment=jnp.where(routed, metrics.route_alignment, signals.goal_alignment),
         driven=signals.driven + jnp.where(active, metrics.speed * control_dt, 0.0),
@@ -115,7 +114,7 @@ def make_columns(signals: RouteSignals, records: Records, *, course: CourseThres
         "against_s": wrong_way_s,
         "red_light_wait_s": red_s,
         "red_light_approaches": np.asarray(signals.red_approaches),
-        "red_light_avoidable": np.asarray(signals.avoidable_reds) > 0,
+        "red_light_avoidable": np.asarray(signals.ran_avoidable),
         "driven_m": np.asarray(signals.driven),
         "max_overspeed_mps": np.asarray(signals.overspeed),
         "clean_completion": clean & records["has_route"],

@@ -20,8 +20,14 @@ LINE = np.array([[-60.0, 0.0], [60.0, 0.0]])
 STEPS, DT, GREEN_S = 45, 1 / 30, 1.0
 
 
-def drive_through(env, scene, course, *, steps):
+@pytest.fixture(scope="module")
+def course():
+    return schema.read(load_config("evaluate")["failures"]["course"], route_signals.CourseThresholds)
+
+
+def drive_through(scene, course, *, steps):
     """The signals after some steps without a pedal."""
+    env = build_env(load_config("task", "dynamics=bicycle"), ending=["numerical_error", "goal_reached"])
 
     @jax.jit
     def drive(scene):
@@ -36,16 +42,13 @@ def drive_through(env, scene, course, *, steps):
     return drive(scene)
 
 
-def test_waiting_for_a_red_light_is_not_counted():
+def test_waiting_for_a_red_light_is_not_counted(course):
     """Cars at rest 30 and 80 m before a light that is red for a second, one that drives towards it, and one behind it."""
-    config = load_config("task", "dynamics=bicycle")
-    env = build_env(config, ending=["numerical_error", "goal_reached"])
-    course = schema.read(load_config("evaluate")["failures"]["course"], route_signals.CourseThresholds)
     lights = [((40.0, 0.0), [(0.0, STOP), (GREEN_S, GO)], np.inf)]
     lines = [LINE + np.array([0.0, 4.0 * row]) for row in range(4)]
     scene = routed_scene(lines, starts=[68.0, 18.0, 45.0, 105.0], speeds=[0, 0, 6, 0], controls=lights, stops=[[(100.0, 0)]] * 4)
 
-    signals = jax.device_get(drive_through(env, scene, course, steps=STEPS))
+    signals = jax.device_get(drive_through(scene, course, steps=STEPS))
     assert signals.red_steps.tolist() == [29, 0, 0, 0], "it is green in the 30th step"
     assert signals.red_approaches.tolist() == [1, 0, 1, 0], "the second is more than 50 m away, the third comes nearer"
     records = {name: np.full(4, name == "goal_reached") for name in EVENTS} | {"has_route": np.ones(4, bool), "route_m": np.full(4, 40.0)}
@@ -55,18 +58,15 @@ def test_waiting_for_a_red_light_is_not_counted():
         assert found.tolist() == [clean, late == 0.0, late == 0.0, late == 0.0]
 
 
-def test_a_red_light_is_avoidable_for_a_car_with_room_to_stop():
+def test_a_red_light_is_avoidable_for_a_car_with_room_to_stop(course):
     """Cars that roll through: 29 and 9 m before a red light at 12 m/s, 14 m before one that turns yellow late; one stands."""
-    config = load_config("task", "dynamics=bicycle")
-    env = build_env(config, ending=["numerical_error", "goal_reached"])
-    course = schema.read(load_config("evaluate")["failures"]["course"], route_signals.CourseThresholds)
     late = [((40.0, 8.0), [(0.0, GO), (0.5, CAUTION), (0.6, STOP)], np.inf)]
     lights = [((40.0, 0.0), [(0.0, STOP)], np.inf), *late]
     lines = [LINE + np.array([0.0, 4.0 * row]) for row in range(4)]
     stops = [[(100.0, 0)], [(100.0, 0)], [(100.0, 1)], [(100.0, 0)]]
     scene = routed_scene(lines, starts=[69.0, 89.0, 84.0, 68.0], speeds=[12, 12, 12, 0], controls=lights, stops=stops)
-    signals = jax.device_get(drive_through(env, scene, course, steps=4 * STEPS))
-    assert signals.avoidable_reds.tolist() == [1, 0, 0, 0]
+    signals = jax.device_get(drive_through(scene, course, steps=4 * STEPS))
+    assert signals.ran_avoidable.tolist() == [1, 0, 0, 0]
     records = {name: np.full(4, name == "red_light") & [True, True, True, False] for name in EVENTS}
     records |= {"has_route": np.ones(4, bool), "route_m": np.full(4, 40.0), "time_s": np.full(4, 4.0)}
     assert route_signals.make_columns(signals, records, course=course, control_hz=1 / DT)["red_light_avoidable"].tolist() == [1, 0, 0, 0]

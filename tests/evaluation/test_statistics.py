@@ -120,6 +120,9 @@ def test_red_lights_count_by_approaches():
     rows = records(np.ones((1, 4)), red_light=np.arange(4)[None] == 0, red_light_approaches=np.array([[1, 3, 0, 5]]))
     rows |= {"has_route": np.arange(4) < 3}
     assert statistics.summarise(rows, bootstrap=10, seed=0)["red_light_per_approach"].value == pytest.approx(1 / 4)
+    assert "avoidable_red_light_per_approach" not in statistics.summarise(rows, bootstrap=10, seed=0), "a table without its column"
+    rows["red_light_avoidable"] = np.zeros(4, bool)
+    assert statistics.summarise(rows, bootstrap=10, seed=0)["avoidable_red_light_per_approach"].value == 0.0, "there was no room to stop"
     del rows["red_light_approaches"]
     assert "red_light_per_approach" not in statistics.summarise(rows, bootstrap=10, seed=0), "not known of older tables"
 

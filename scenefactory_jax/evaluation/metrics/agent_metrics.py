@@ -44,6 +44,13 @@ def _rate(label: str, definition: str, value: Callable[[Records], np.ndarray], c
     return Metric(label, FRACTION, definition, value, counted, by_world, rate=True, optional=counted is _has_route)
 
 
+def _per_approach(label: str, definition: str, column: str) -> Metric:
+    """A column's part of the red lights that agents with routes came near; of tables that have both columns."""
+    known = lambda records: np.asarray(_has_route(records), bool) & ({APPROACHES, column} <= set(records))  # noqa: E731
+    lights = lambda records: np.maximum(_on_route(APPROACHES)(records), records["red_light"])  # noqa: E731
+    return Metric(label, FRACTION, definition, _on_route(column), known, weight=lights, optional=True)
+
+
 METRICS: dict[str, Metric] = {
     "success_rate": _rate("Success rate", "Agents that came within the goal radius, of all spawned agents.", _column("goal_reached")),
     "clean_success_rate": _rate(
@@ -106,15 +113,11 @@ METRICS: dict[str, Metric] = {
     "red_light_rate": _rate(
         "Red lights run", "Agents whose front passed a stop line at a red light, of the agents with a route.", _column("red_light"),
         _has_route),
-    "red_light_per_approach": Metric(
-        "Red lights run, of approaches", FRACTION, "Red lights run, of those that an agent with a route came within 50 m of.",
-        _column("red_light"), lambda records: np.asarray(_has_route(records), bool) & (APPROACHES in records),
-        weight=lambda records: np.maximum(_on_route(APPROACHES)(records), records["red_light"]), optional=True),
-    "avoidable_red_light_per_approach": Metric(
-        "Red lights run with room to stop", FRACTION, "Red lights run that had been yellow or red while the car could stop with 3 m/s², of "
-        "those that an agent with a route came within 50 m of.",
-        lambda records: _on_route(AVOIDABLE)(records), lambda records: np.asarray(_has_route(records), bool) & (AVOIDABLE in records),
-        weight=lambda records: np.maximum(_on_route(APPROACHES)(records), records["red_light"]), optional=True),
+    "red_light_per_approach": _per_approach(
+        "Red lights run, of approaches", "Red lights run, of those that an agent with a route came within 50 m of.", "red_light"),
+    "avoidable_red_light_per_approach": _per_approach(
+        "Red lights run with room to stop", "Red lights run that had been yellow or red while the car could stop with 3 m/s², of those "
+        "that an agent with a route came within 50 m of.", AVOIDABLE),
     "stop_sign_rate": _rate(
         "Stop signs run", "Agents whose front passed the line of a stop sign without having stood before it, of the agents with a route.",
         _column("stop_sign"), _has_route),
