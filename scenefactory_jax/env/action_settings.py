@@ -46,7 +46,7 @@ def move(action: Float[Array, "A 3"], previous: Float[Array, "A 3"], *, rates: R
         previous: throttle, steer and brake of the last action.
         action_s: between two actions.
     """
-    pedal, steer = previous[:, 0] - previous[:, 2], previous[:, 1]
+    pedal, steer = jnp.abs(previous[:, 0]) - previous[:, 2], previous[:, 1]  # a throttle below zero is that of the reverse gear
     number = action if rates.exponent == 1.0 else jnp.sign(action) * jnp.abs(action) ** rates.exponent
     rate = jnp.where(number[:, 0] > 0.0, rates.up_per_s, rates.down_per_s) * number[:, 0]
     pedal = jnp.clip(pedal + rate * action_s, -1.0, rates.most_throttle)

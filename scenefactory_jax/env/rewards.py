@@ -19,6 +19,7 @@ from scenefactory_jax.core.instantiate import instantiate
 from scenefactory_jax.core.schema import ConfigError, Count, Fraction, NonNegative, Positive, Weight, read_value
 from scenefactory_jax.core.types import RewardInput
 from scenefactory_jax.env import route_following
+from scenefactory_jax.env.bend_speed import find_bend_speed
 from scenefactory_jax.env.leaders import find_leaders
 from scenefactory_jax.env.termination import EventName
 from scenefactory_jax.roadgraph import traffic_lights
@@ -66,6 +67,25 @@ def route_distance(step: RewardInput, *, limit_m: Positive) -> Float[Array, " A"
 def overspeed(step: RewardInput, *, limit_mps: Positive) -> Float[Array, " A"]:
     """Speed above the route's speed limit as a fraction of a limit, clamped to 1; 0 where no speed limit is known."""
     return jnp.clip(step.metrics.overspeed / limit_mps, 0.0, 1.0)
+
+
+def bend_speed(
+    step: RewardInput,
+    *,
+    limit_mps: Positive,
+    look_ahead_m: Positive,
+    chord_m: Positive,
+    lateral_mps2: Positive,
+    braking_mps2: Positive,
+) -> Float[Array, " A"]:
+    """Speed above that with which the car can keep to the bends of its route ahead, as a fraction of a limit, clamped to 1.
+
+    Args:
+        limit_mps: the others as of `find_bend_speed`. Of recorded drivers' moving steps 2 % are above 4 m/s^2 and braking of 3 m/s^2.
+    """
+    numbers = {"look_ahead_m": look_ahead_m, "chord_m": chord_m, "lateral_mps2": lateral_mps2, "braking_mps2": braking_mps2}
+    slowest = find_bend_speed(step.scene, step.after, **numbers)
+    return jnp.clip((safe_norm(step.after.motion.velocity[:, :2]) - slowest) / limit_mps, 0.0, 1.0)
 
 
 def stop_line_speed(step: RewardInput, *, braking_mps2: Positive, limit_mps: Positive, control_dt: float) -> Float[Array, " A"]:

@@ -19,7 +19,8 @@ NEAREST = {"_target_": "nearest_controls", "count": 3, "radius_m": 50.0, "distan
 BEYOND = {name: {**ENTRIES[kind], "beyond_goal": True} for name, kind in {"far_route": "route", "far_goal": "ego"}.items()}
 NAMED = {name: ENTRIES[name] for name in ("route", "lights", "signs", "ego")}
 AGED = {"aged_lights": {**ENTRIES["lights"], "age_scale_s": 3.0}}
-GROUPS = observations.make(NAMED | BEYOND | AGED | {"nearest": NEAREST}, control_dt=DT)
+BENDS = {name: load_config("train", "observations=drive_bends")["observations"][name] for name in ("bend_speed", "own_size")}
+GROUPS = observations.make(NAMED | BEYOND | AGED | BENDS | {"nearest": NEAREST}, control_dt=DT)
 AHEAD = ENTRIES["route"]["ahead_m"]
 
 
@@ -96,6 +97,21 @@ def test_the_route_is_seen_from_the_car():
     np.testing.assert_allclose(points[row], [11 / 50, -50 / 50, 1.0, 0.0, 0.0], atol=1e-5)
     np.testing.assert_allclose(points[AHEAD.index(90.0)], points[AHEAD.index(80.0)])  # the goal lies 80 m ahead
     assert not seen[1].any()  # no route
+
+
+@pytest.mark.parametrize(("arc", "room"), [(8.0, 48.0), (40.0, 16.0), (56.0, 0.0), (60.0, 0.0)])
+def test_the_speed_for_the_corner_ahead(arc, room):
+    """Two chords of 4 m meet at the corner at metre 60: 4 m/s^2 by 90 degrees in 4 m, and braking of 3 m/s^2 before the first."""
+    speed = np.sqrt(4.0 / (np.pi / 2 / 4.0) + 2 * 3.0 * room)
+    seen = observe(arc=arc, place=(min(arc, 60.0), max(arc - 60.0, 0.0)))
+    np.testing.assert_allclose(seen["bend_speed"][0], [speed / (10.0 + speed), max(-speed / 10.0, -1.0)], rtol=1e-4)
+    np.testing.assert_array_equal(seen["bend_speed"][1], [1.0, -1.0])  # no route
+    np.testing.assert_allclose(seen["own_size"], [[0.8, 1.0]] * 2)
+
+
+def test_behind_a_corner_and_at_the_end_of_a_route_no_bend_is_seen():
+    for arc in (66.0, 94.0, 98.5, 100.0):
+        np.testing.assert_array_equal(observe(arc=arc, place=(60.0, arc - 60.0))["bend_speed"][0], [1.0, -1.0])
 
 
 def test_behind_the_goal_the_end_of_the_route_takes_its_place():

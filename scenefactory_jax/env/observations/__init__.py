@@ -27,11 +27,12 @@ from scenefactory_jax.env.observations.planning import planning
 from scenefactory_jax.env.observations.reward_vector import reward_weights
 from scenefactory_jax.env.observations.road_set import road
 from scenefactory_jax.env.observations.route_neighbours import route_neighbours
-from scenefactory_jax.env.observations.route_vector import route
+from scenefactory_jax.env.observations.route_vector import bend_speed, route
 from scenefactory_jax.env.observations.state_vectors import (
     ego,
     friction_ahead,
     grade_ahead,
+    own_size,
     previous_action,
     weather,
     yaw_rate_and_steer,
@@ -40,6 +41,7 @@ from scenefactory_jax.env.observations.vmax import vmax_base, vmax_lane, vmax_ro
 
 __all__ = ["ANY", "FRACTION", "LENGTH", "SIGNED", "Group", "bound_observation", "make", "observe"]
 __all__ += [
+    "bend_speed",
     "closest_approach",
     "edge_rays",
     "ego",
@@ -50,6 +52,7 @@ __all__ += [
     "lights",
     "nearest_controls",
     "neighbours",
+    "own_size",
     "previous_action",
     "reward_weights",
     "road",

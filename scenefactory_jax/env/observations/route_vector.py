@@ -3,10 +3,11 @@
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from scenefactory_jax.core.geometry import cross, dot, heading_vector, to_frame
+from scenefactory_jax.core.geometry import cross, dot, heading_vector, safe_norm, to_frame
 from scenefactory_jax.core.schema import Positive
 from scenefactory_jax.core.types import ROUTE_SPACING_M, Scene, State
 from scenefactory_jax.env import route_following
+from scenefactory_jax.env.bend_speed import find_bend_speed
 from scenefactory_jax.env.observations.column_bounds import ANY, FRACTION, LENGTH, SIGNED, bound_observation, compress_length
 
 POINT = (ANY, ANY, SIGNED, SIGNED, LENGTH)  # bounds of the columns of a point
@@ -61,3 +62,24 @@ def route(
     columns = jnp.concatenate([ahead, to_frame(direction[:, 1:], yaw), limit[..., None]], axis=-1)
     features = jnp.concatenate([jnp.stack(head, axis=1), columns.reshape(len(offset), -1)], axis=1)
     return jnp.where(route_following.find_routed(scene, agents)[:, None], features, 0.0)
+
+
+@bound_observation(FRACTION, SIGNED)
+def bend_speed(
+    scene: Scene,
+    state: State,
+    *,
+    speed_scale_mps: Positive,
+    look_ahead_m: Positive,
+    chord_m: Positive,
+    lateral_mps2: Positive,
+    braking_mps2: Positive,
+) -> Float[Array, "A 2"]:
+    """The speed v with which the car can keep to the bends of its route ahead (`find_bend_speed`, which has the other arguments).
+
+    Columns: v / (scale + v), 1 without a bend or a route; by how much the car is faster than v, over `speed_scale_mps`, clamped to 1.
+    """
+    numbers = {"look_ahead_m": look_ahead_m, "chord_m": chord_m, "lateral_mps2": lateral_mps2, "braking_mps2": braking_mps2}
+    slowest = find_bend_speed(scene, state, **numbers)
+    excess = (safe_norm(state.motion.velocity[:, :2]) - slowest) / speed_scale_mps
+    return jnp.stack([compress_length(slowest, speed_scale_mps), jnp.clip(excess, -1.0, 1.0)], axis=1)

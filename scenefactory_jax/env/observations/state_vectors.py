@@ -41,6 +41,12 @@ def previous_action(scene: Scene, state: State) -> Float[Array, "A 3"]:
     return state.previous_action
 
 
+@bound_observation(LENGTH)
+def own_size(scene: Scene, state: State, *, length_scale_m: Positive, width_scale_m: Positive) -> Float[Array, "A 2"]:
+    """Length and width of the car's outline, over their scales: where cars differ (`scenes.pack.car_size_m=null`), so do gaps they fit."""
+    return state.agents.size / jnp.array([length_scale_m, width_scale_m])
+
+
 @bound_observation(LENGTH, FRACTION)
 def weather(scene: Scene, state: State, *, film_scale_mm: Positive, surfaces: list[str]) -> Float[Array, "A F"]:
     """Water film and one-hot surface at each car, [film, AC, SMA, OGFC] in Eq. 2 of the paper.
