@@ -20,6 +20,8 @@ class Rates:
     steer_per_s: Positive
     most_throttle: Fraction = 1.0
     exponent: Positive = 1.0  # of the size of a number: above 1 small numbers move little, and so does the noise about them
+    reverse_below_mps: Positive | None = None  # with command `pedals_with_reverse`: speed forward below which a pedal that falls from 0
+    # or above it drives backwards, until it rises again; one that falls while the car is faster brakes. None: it always brakes
 
 
 @dataclasses.dataclass(frozen=True)
@@ -36,22 +38,30 @@ class Actions:
         return self.rates and functools.partial(move, rates=self.rates, action_s=action_s)
 
 
-def move(action: Float[Array, "A 3"], previous: Float[Array, "A 3"], *, rates: Rates, action_s: float) -> Float[Array, "A 3"]:
+def move(
+    action: Float[Array, "A 3"], previous: Float[Array, "A 3"], speed: Float[Array, " A"], *, rates: Rates, action_s: float
+) -> Float[Array, "A 3"]:
     """Moves pedals and steering from where they are, for commands of one pedal: the third number is as it was given.
 
     Gigaflow's cars (Cusumano-Towner et al. 2025, arXiv:2502.03349) choose their jerk in this way: noise on an action changes the driving
-    smoothly, and braking can build up faster than acceleration.
+    smoothly, and braking can build up faster than acceleration. With `reverse_below_mps` a car that has stopped by its brakes drives
+    backwards when its pedal has been released and falls again, and the results are throttle, steer and brake.
 
     Args:
         previous: throttle, steer and brake of the last action.
+        speed: forward, m/s.
         action_s: between two actions.
     """
-    pedal, steer = jnp.abs(previous[:, 0]) - previous[:, 2], previous[:, 1]  # a throttle below zero is that of the reverse gear
+    before, steer = previous[:, 0] - previous[:, 2], previous[:, 1]
     number = action if rates.exponent == 1.0 else jnp.sign(action) * jnp.abs(action) ** rates.exponent
     rate = jnp.where(number[:, 0] > 0.0, rates.up_per_s, rates.down_per_s) * number[:, 0]
-    pedal = jnp.clip(pedal + rate * action_s, -1.0, rates.most_throttle)
+    pedal = jnp.clip(before + rate * action_s, -1.0, rates.most_throttle)
     steer = jnp.clip(steer + rates.steer_per_s * action_s * number[:, 1], -1.0, 1.0)
-    return jnp.concatenate([jnp.stack([pedal, steer], axis=1), action[:, 2:]], axis=1)
+    if rates.reverse_below_mps is None:
+        return jnp.concatenate([jnp.stack([pedal, steer], axis=1), action[:, 2:]], axis=1)
+    starts = (before >= 0.0) & (speed < rates.reverse_below_mps)
+    brakes = (pedal < 0.0) & ~(starts | (previous[:, 0] < 0.0))
+    return jnp.stack([jnp.where(brakes, 0.0, pedal), steer, jnp.where(brakes, -pedal, 0.0)], axis=1)
 
 
 def refuse_rates(config: Mapping[str, Any], *, what: str) -> None:

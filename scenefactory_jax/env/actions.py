@@ -37,13 +37,3 @@ def acceleration_and_steering(action: Float[Array, "A 3"]) -> Float[Array, "A 3"
     """
     acceleration, steer, _ = action.T
     return jnp.stack([jnp.maximum(acceleration, 0.0), steer, jnp.maximum(-acceleration, 0.0)], axis=1)
-
-
-def acceleration_steering_and_gear(action: Float[Array, "A 3"]) -> Float[Array, "A 3"]:
-    """Acceleration, steering, and the reverse gear where the third number is below -0.5, so that noise about 0 seldom shifts.
-
-    In that gear an acceleration above zero drives backwards (`pedals_with_reverse` says when it engages); below zero it brakes, too.
-    """
-    acceleration, steer, gear = action.T
-    throttle = jnp.maximum(acceleration, 0.0)
-    return jnp.stack([jnp.where(gear < -0.5, -throttle, throttle), steer, jnp.maximum(-acceleration, 0.0)], axis=1)

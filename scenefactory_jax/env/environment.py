@@ -14,7 +14,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from scenefactory_jax.core import schema
-from scenefactory_jax.core.geometry import safe_norm
+from scenefactory_jax.core.geometry import dot, heading_vector, safe_norm
 from scenefactory_jax.core.instantiate import instantiate
 from scenefactory_jax.core.pytree import check, check_array, is_finite, replace, to_jax, to_strong_type, tree_where, unchecked
 from scenefactory_jax.core.schema import ConfigError, NonNegative, Positive
@@ -113,7 +113,7 @@ class EnvParts(NamedTuple):
     respawn_clearance_m: float | None  # see `Spawning`
     hides_weather: bool = False  # from the observations: `weather.hidden`
     history: HistorySpec | None = None  # rows of `State.history`; None: nothing reads it
-    move_action: Callable[..., Float[Array, "A 3"]] | None = None  # (action, throttle, steer, brake before) -> what `map_action` reads
+    move_action: Callable[..., Float[Array, "A 3"]] | None = None  # (action, last throttle, steer, brake; m/s) -> for `map_action`
 
 
 def make_env(config: Mapping[str, Any]) -> Env:
@@ -327,7 +327,9 @@ def _observe(parts: EnvParts, scene: Scene, state: State) -> Observation:
 def _hold_action(parts: EnvParts, state: State, action: Float[Array, "A 3"]) -> Float[Array, "A 3"]:
     """Computes throttle, steer and brake of this control step: of the new action if one is read, else of the previous one."""
     action = jnp.clip(action, -1.0, 1.0)
-    action = action if parts.move_action is None else parts.move_action(action, state.previous_action)
+    if parts.move_action is not None:
+        forward = dot(state.motion.velocity[:, :2], heading_vector(state.motion.yaw))
+        action = parts.move_action(action, state.previous_action, forward)
     new = jnp.clip(parts.map_action(action), -1.0, 1.0)
     return new if parts.action_repeat == 1 else jnp.where(state.step % parts.action_repeat == 0, new, state.previous_action)
 

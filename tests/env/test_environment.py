@@ -209,12 +209,6 @@ def test_pedals_below_zero_are_released_or_reverse():
     np.testing.assert_array_equal(jitted(actions.pedals_with_reverse)(asked), np.float32([[0.6, -0.2, 0.0], [-0.3, 0.1, 0.7]]))
 
 
-def test_the_third_number_engages_the_reverse_gear():
-    asked = np.float32([[0.6, -0.2, -0.4], [0.6, 0.1, -0.6], [-0.3, 0.1, -0.6]])
-    wanted = np.float32([[0.6, -0.2, 0.0], [-0.6, 0.1, 0.0], [0.0, 0.1, 0.3]])
-    np.testing.assert_array_equal(jitted(actions.acceleration_steering_and_gear)(asked), wanted)
-
-
 def test_controls_are_what_dynamics_and_rewards_are_given(config):
     """Off the throttle a bicycle rolls on; with one pedal it brakes."""
     own = scenefactory_jax.load_config("task", "dynamics=bicycle", "spawning=logged", "observations.road=null")
@@ -621,22 +615,45 @@ def test_numbers_that_cannot_work_are_refused_by_name(override, message):
 def test_rates_move_pedals_and_steering(config):
     """0.1 s each: the pedal moves by 2/s up and 4/s down from throttle less brake, and not beyond its end; the steering by 1.5/s."""
     rates = action_settings.Rates(up_per_s=2.0, down_per_s=4.0, steer_per_s=1.5)
-    move = functools.partial(action_settings.move, rates=rates, action_s=0.1)
-    env = build_env(config, hold=3, move=move, command=actions.acceleration_steering_and_gear)
+    env = build_env(config, hold=3, move=functools.partial(action_settings.move, rates=rates, action_s=0.1))
     scene = scene_of([[0, 0], [40, 0]], [[60, 0], [60, 0]], speeds=[1.0, 0.0])
     state, _ = env.reset(jax.random.key(0), scene)
     applied = []
-    for asked in ((1.0, 1.0, 0.0), (1.0, -0.5, -1.0), (-0.5, 0.0, -1.0), (-1.0, 3.0, -1.0)):
-        state, _ = jitted(env.step)(scene, state, jnp.tile(jnp.array(asked), (2, 1)))
+    for pedal, steer in ((1.0, 1.0), (1.0, -0.5), (-1.0, 0.0), (-0.5, 3.0)):
+        state, _ = jitted(env.step)(scene, state, jnp.tile(jnp.array([pedal, steer, 0.7]), (2, 1)))
         applied.append(np.asarray(state.previous_action[0]))
-    # the reverse gear turns the sign of the throttle, not the pedal's way
-    np.testing.assert_allclose(applied, [[0.2, 0.15, 0.0], [-0.4, 0.075, 0.0], [-0.2, 0.075, 0.0], [0.0, 0.225, 0.2]], atol=1e-6)
+    # pedals_with_reverse keeps the sign of the throttle, and the third number is its brake
+    np.testing.assert_allclose(applied, [[0.2, 0.15, 0.7], [-0.3, 0.075, 0.7], [-1.0, 0.075, 0.7], [-1.0, 0.225, 0.7]], atol=1e-6)
+    still = jnp.zeros(2)
     move = functools.partial(action_settings.move, rates=dataclasses.replace(rates, most_throttle=0.25), action_s=0.1)
-    found = move(jnp.array([[1.0, 0.0, 0.0], [-1.0, 0.0, 0.0]]), jnp.array([[0.2, 0.0, 0.0], [0.0, 0.0, 0.9]]))
+    found = move(jnp.array([[1.0, 0.0, 0.0], [-1.0, 0.0, 0.0]]), jnp.array([[0.2, 0.0, 0.0], [0.0, 0.0, 0.9]]), still)
     np.testing.assert_allclose(found[:, 0], [0.25, -1.0], err_msg="full brakes, but not full throttle")
     move = functools.partial(action_settings.move, rates=dataclasses.replace(rates, exponent=2.0), action_s=0.1)
-    found = move(jnp.array([[0.5, -1.0, 0.3], [-0.5, 0.2, 0.3]]), jnp.zeros((2, 3)))
+    found = move(jnp.array([[0.5, -1.0, 0.3], [-0.5, 0.2, 0.3]]), jnp.zeros((2, 3)), still)
     np.testing.assert_allclose(found, [[0.05, -0.15, 0.3], [-0.1, 0.006, 0.3]], atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("pedal", "speed", "last", "expected"),  # last and expected: throttle, brake
+    [
+        (-0.5, 0.4, (0.1, 0.0), (-0.1, 0.0)),  # falls through 0 while the car stands
+        (-0.5, 0.6, (0.1, 0.0), (0.0, 0.1)),  # while it rolls
+        (-0.5, 0.0, (0.0, 0.3), (0.0, 0.5)),  # a car that its brakes have stopped stands
+        (0.5, 0.0, (0.0, 0.3), (0.0, 0.2)),
+        (0.5, 0.0, (0.0, 0.1), (0.0, 0.0)),  # released
+        (-0.5, -3.0, (-0.2, 0.0), (-0.4, 0.0)),  # backwards
+        (0.5, -3.0, (-0.2, 0.0), (-0.1, 0.0)),
+        (1.0, -3.0, (-0.1, 0.0), (0.1, 0.0)),  # forward again
+        (-0.5, 5.0, (-0.1, 0.0), (-0.3, 0.0)),  # a car that was pushed: the engine idles (`compute_drive_torque`)
+        (0.5, 5.0, (0.3, 0.0), (0.4, 0.0)),
+    ],
+)
+def test_a_pedal_that_falls_while_the_car_stands_drives_backwards(pedal, speed, last, expected):
+    rates = action_settings.Rates(up_per_s=2.0, down_per_s=4.0, steer_per_s=1.5, reverse_below_mps=0.5)
+    found = action_settings.move(
+        jnp.array([[pedal, 0.0, 0.7]]), jnp.array([[last[0], 0.0, last[1]]]), jnp.array([speed]), rates=rates, action_s=0.1
+    )
+    np.testing.assert_allclose(found[0, ::2], expected, atol=1e-6)
 
 
 def test_planners_and_imitation_refuse_rates():

@@ -37,14 +37,11 @@ def glide() -> Dynamics:
     return Dynamics(init, advance, read)
 
 
-def build_env(
-    config, *, draw=spawning.logged, steps=1500, respawn=None, ending=None, beside=None, hold=1, move=None,
-    command=actions.pedals_with_reverse,
-):  # fmt: skip
+def build_env(config, *, draw=spawning.logged, steps=1500, respawn=None, ending=None, beside=None, hold=1, move=None):
     metrics = schema.read(config["step_metrics"], step_metrics.StepMetricsConfig)
     parts = environment.EnvParts(
         dynamics=glide(),
-        map_action=command,
+        map_action=actions.pedals_with_reverse,
         action_repeat=hold,
         sample_agents=draw,
         sample_weather=keep_condition,
