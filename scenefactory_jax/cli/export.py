@@ -37,7 +37,7 @@ def export(config: Mapping[str, Any]) -> Path:
     trained = policy_io.load_policy(config["run"], trust=config["trust"])
     configs.print_outside_targets(trained.config, trained.folder)
     (out / "checkpoints").mkdir(parents=True)
-    file = checkpoint.write_parameters(out / "checkpoints", trained.parameters)
+    file = checkpoint.write_parameters(out / "checkpoints", trained.parameters, dtype=config["dtype"])
     scenes = trained.config["scenes"]
     scenes = {**scenes, "path": None, "heldout": {**scenes["heldout"], "path": None}}  # without paths of this machine
     exported = {**trained.config, "out": None, "resume": False, "start_from": None, "scenes": scenes}

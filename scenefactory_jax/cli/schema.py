@@ -162,6 +162,7 @@ class Export:
     run: str
     trust: bool
     out: str
+    dtype: Literal["float32", "float16"]
     card: Card
 
 

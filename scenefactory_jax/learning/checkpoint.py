@@ -155,7 +155,7 @@ def restore_parameters(folder: Path | str, iteration: int | None = None) -> Any:
     if iteration is None and exported.is_file():
         if damage := _find_damage(exported):
             raise ConfigError(f"{exported}: damaged: {damage}; restore it from a copy")
-        arrays = _load(exported)
+        arrays = {name: leaf.astype(np.float32) if leaf.dtype == np.float16 else leaf for name, leaf in _load(exported).items()}
     else:
         file = _find(folder, iteration)
         averaged, last = _load(file, AVERAGED), _load(file, PARAMETERS)
@@ -195,10 +195,16 @@ def put_networks(folder: Path | str, state: Any) -> tuple[Any, list[str]]:
     return jax.tree.unflatten(jax.tree.structure(state), placed), [PARAMETERS, *taken]
 
 
-def write_parameters(folder: Path | str, parameters: Any) -> Path:
-    """Writes parameters to one compressed file of the folder, which `restore_parameters` reads."""
+def write_parameters(folder: Path | str, parameters: Any, *, dtype: str = "float32") -> Path:
+    """Writes parameters to one compressed file of the folder, which `restore_parameters` reads.
+
+    Args:
+        dtype: of floating-point numbers in the file; with float16 it has half the size, and they are read back rounded.
+    """
     file = Path(folder) / FILE
-    _write(file, jax.device_get(name_leaves(parameters)), savez=np.savez_compressed)
+    arrays = jax.device_get(name_leaves(parameters))
+    stored = {name: leaf.astype(dtype) if np.issubdtype(leaf.dtype, np.floating) else leaf for name, leaf in arrays.items()}
+    _write(file, stored, savez=np.savez_compressed)
     return file
 
 

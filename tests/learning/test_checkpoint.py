@@ -177,6 +177,15 @@ def test_damage_is_named_with_the_checkpoint_before(saved, tmp_path, damage, rea
         checkpoint.restore_parameters(tmp_path)
 
 
+def test_an_exported_policy_of_half_precision_is_read_back_rounded(saved, tmp_path):
+    parameters = checkpoint.restore_parameters(saved[0])
+    with np.load(checkpoint.write_parameters(tmp_path, parameters, dtype="float16")) as file:
+        assert {file[name].dtype for name in file.files} == {np.dtype(np.float16)}
+    read = checkpoint.restore_parameters(tmp_path)
+    assert {leaf.dtype for leaf in jax.tree.leaves(read)} == {np.dtype(np.float32)}
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-3, atol=1e-6), read, parameters)
+
+
 def test_damage_of_an_exported_policy_is_found(saved, tmp_path):
     parameters = checkpoint.restore_parameters(saved[0])
     file = checkpoint.write_parameters(tmp_path, parameters)
