@@ -129,6 +129,8 @@ class Tasks:
         for where, names in {"planner": [config["planner"]], "solution.planners": config["solution"]["planners"]}.items():
             if unknown := [name for name in names if name is not None and name not in words]:
                 raise ConfigError(f"{where}: expected names of {', '.join(words)}, got {unknown[0]!r}")
+        if not config["search"]["starts"]:
+            raise ConfigError("search.starts: expected one pair [acceleration, curvature] or more, got []")
         if (config["planner"] is None) == (config["run"] is None):
             raise ConfigError(f"planner: expected a planner or run=RUN, one of them; got {config['planner']} and run={config['run']}")
 

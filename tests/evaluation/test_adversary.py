@@ -147,6 +147,8 @@ def test_errors_name_the_key(bank, tmp_path):
         (["planner=null"], "planner: expected a planner or run=RUN"),
         (["solution.planners=[nobody]"], r"solution\.planners: expected names of"),
         (["search.rounds=0"], "search.rounds: expected an integer >= 1"),
+        (["search.starts=[]"], r"search\.starts: expected one pair \[acceleration, curvature\] or more, got \[\]"),
+        (["search.starts=[[0.3]]"], r"search\.starts: expected \[a number, a number\], got \[0\.3\]"),
         (["protocol=recorded"], "protocol: expected one with scores"),
     ):
         with pytest.raises(ConfigError, match=message):

@@ -63,8 +63,9 @@ def attack_world(
 ) -> Attack:
     """Attacks the ego of one world.
 
+    Searches begin with the actions of the log and those of `search.starts` beside them; the result is that of the first one with a success.
     In each round Adam improves the actions against the ego's last drive; then the ego is simulated among the adversaries, without a
-    gradient. The first round with a success ends the search of the world. A round before all others leaves the traffic as it is logged.
+    gradient. The first round with a success ends a search. A round before all others leaves the traffic as it is logged.
 
     Args:
         drive: the ego's.
@@ -76,10 +77,10 @@ def attack_world(
     chosen, reasons = choose_adversaries(scene, settings, start_row=start_row, steps=steps)
     problem, ego_size = make_logged_problem(scene, chosen, settings, start_row=start_row), scene.agents.size[EGO]
     optimizer = make_optimizer(settings, chosen.steers & chosen.eligible)
-    change = jnp.zeros_like(chosen.actions)
+    starts = jnp.array(settings.search.starts)[:, None, None] * jnp.stack([jnp.ones_like(chosen.steers), chosen.steers], axis=-1)[:, None]
+    starts = jnp.broadcast_to(starts, (len(starts), *chosen.actions.shape))
     seen: Drive = _make_zeros(drive, parameters, scene, key)
     blank: Outcome = _make_zeros(judge, scene, seen, chosen.followed, problem, settings)
-    begun = (change, optimizer.init(change), seen, blank, blank.contact, jnp.int32(0))
 
     def run_round(carry: tuple, number: Int[Array, ""]) -> tuple[tuple, None]:
         change, memory, driven, outcome, plain, _ = carry
@@ -96,7 +97,14 @@ def attack_world(
         after = (change, memory, driven, now, plain, number)
         return jax.tree.map(lambda old, new: jnp.where(outcome.success, old, new), carry, after), None
 
-    (change, _, driven, outcome, plain, rounds), _ = jax.lax.scan(run_round, begun, jnp.arange(settings.search.rounds + 1))
+    def search(start: Float[Array, "K M 2"]) -> tuple:
+        begun = (start, optimizer.init(start), seen, blank, blank.contact, jnp.int32(0))
+        return jax.lax.scan(run_round, begun, jnp.arange(settings.search.rounds + 1))[0]
+
+    found = jax.vmap(search)(starts)
+    success, rounds = found[3].success, found[5]
+    first = jnp.argmin(jnp.where(success, rounds, settings.search.rounds + 1))
+    change, _, driven, outcome, plain, rounds = jax.tree.map(lambda leaf: leaf[first], found)
     return Attack(chosen, reasons, plain, move(change, problem, settings), driven, outcome, rounds)
 
 

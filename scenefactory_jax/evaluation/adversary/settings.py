@@ -56,6 +56,7 @@ class Costs:
 class Search:
     """Adam, and how often the ego is simulated again."""
 
+    starts: list[tuple[float, float]]  # changes of acceleration and of curvature, at all times, with which a search each begins
     rounds: Count
     iterations: Count  # of a round
     contact_depth_m: NonNegative
