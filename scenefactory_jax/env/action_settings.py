@@ -10,6 +10,8 @@ from jaxtyping import Array, Float
 
 from scenefactory_jax.core.schema import ConfigError, Count, Fraction, Positive
 
+RELEASED = 1e-3  # a pedal that is less below 0 is released: steps of rates seldom end at 0
+
 
 @dataclasses.dataclass(frozen=True)
 class Rates:
@@ -59,7 +61,7 @@ def move(
     steer = jnp.clip(steer + rates.steer_per_s * action_s * number[:, 1], -1.0, 1.0)
     if rates.reverse_below_mps is None:
         return jnp.concatenate([jnp.stack([pedal, steer], axis=1), action[:, 2:]], axis=1)
-    starts = (before >= 0.0) & (speed < rates.reverse_below_mps)
+    starts = (before > -RELEASED) & (speed < rates.reverse_below_mps)
     brakes = (pedal < 0.0) & ~(starts | (previous[:, 0] < 0.0))
     return jnp.stack([jnp.where(brakes, 0.0, pedal), steer, jnp.where(brakes, -pedal, 0.0)], axis=1)
 

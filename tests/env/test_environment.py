@@ -641,6 +641,7 @@ def test_rates_move_pedals_and_steering(config):
         (-0.5, 0.0, (0.0, 0.3), (0.0, 0.5)),  # a car that its brakes have stopped stands
         (0.5, 0.0, (0.0, 0.3), (0.0, 0.2)),
         (0.5, 0.0, (0.0, 0.1), (0.0, 0.0)),  # released
+        (-0.5, 0.0, (0.0, 1e-7), (-0.2, 0.0)),  # falls again; steps up to 0 are rounded
         (-0.5, -3.0, (-0.2, 0.0), (-0.4, 0.0)),  # backwards
         (0.5, -3.0, (-0.2, 0.0), (-0.1, 0.0)),
         (1.0, -3.0, (-0.1, 0.0), (0.1, 0.0)),  # forward again
