@@ -24,6 +24,7 @@ class Rates:
     exponent: Positive = 1.0  # of the size of a number: above 1 small numbers move little, and so does the noise about them
     reverse_below_mps: Positive | None = None  # with command `pedals_with_reverse`: speed forward below which a pedal that falls from 0
     # or above it drives backwards, until it rises again; one that falls while the car is faster brakes. None: it always brakes
+    most_reverse: Fraction = 1.0  # throttle backwards
 
 
 @dataclasses.dataclass(frozen=True)
@@ -63,7 +64,7 @@ def move(
         return jnp.concatenate([jnp.stack([pedal, steer], axis=1), action[:, 2:]], axis=1)
     starts = (before > -RELEASED) & (speed < rates.reverse_below_mps)
     brakes = (pedal < 0.0) & ~(starts | (previous[:, 0] < 0.0))
-    return jnp.stack([jnp.where(brakes, 0.0, pedal), steer, jnp.where(brakes, -pedal, 0.0)], axis=1)
+    return jnp.stack([jnp.where(brakes, 0.0, jnp.maximum(pedal, -rates.most_reverse)), steer, jnp.where(brakes, -pedal, 0.0)], axis=1)
 
 
 def refuse_rates(config: Mapping[str, Any], *, what: str) -> None:

@@ -643,6 +643,7 @@ def test_rates_move_pedals_and_steering(config):
         (0.5, 0.0, (0.0, 0.1), (0.0, 0.0)),  # released
         (-0.5, 0.0, (0.0, 1e-7), (-0.2, 0.0)),  # falls again; steps up to 0 are rounded
         (-0.5, -3.0, (-0.2, 0.0), (-0.4, 0.0)),  # backwards
+        (-0.5, -3.0, (-0.4, 0.0), (-0.5, 0.0)),  # at most
         (0.5, -3.0, (-0.2, 0.0), (-0.1, 0.0)),
         (1.0, -3.0, (-0.1, 0.0), (0.1, 0.0)),  # forward again
         (-0.5, 5.0, (-0.1, 0.0), (-0.3, 0.0)),  # a car that was pushed: the engine idles (`compute_drive_torque`)
@@ -650,7 +651,7 @@ def test_rates_move_pedals_and_steering(config):
     ],
 )
 def test_a_pedal_that_falls_while_the_car_stands_drives_backwards(pedal, speed, last, expected):
-    rates = action_settings.Rates(up_per_s=2.0, down_per_s=4.0, steer_per_s=1.5, reverse_below_mps=0.5)
+    rates = action_settings.Rates(up_per_s=2.0, down_per_s=4.0, steer_per_s=1.5, reverse_below_mps=0.5, most_reverse=0.5)
     found = action_settings.move(
         jnp.array([[pedal, 0.0, 0.7]]), jnp.array([[last[0], 0.0, last[1]]]), jnp.array([speed]), rates=rates, action_s=0.1
     )
