@@ -565,6 +565,7 @@ def test_what_a_user_can_mend_is_one_line(arguments, message, monkeypatch, capsy
 
 PLANNERS = tuple(f"policy={name}" for name in ("pure_pursuit", "route_pursuit", "idm_route", "pdm_closed", "expert", "constant", "random"))
 FOR_PLANNERS = ("observations=planning", "observations=log", "observations=noise")
+RATES = ("actions=rates_10hz", "actions=rates_10hz_reverse")
 
 
 PARTS = ("base", "cloning")  # files of options that are none
@@ -575,7 +576,7 @@ def option_sets():
     others = ("command", "hydra_settings", "task", "experiment", "protocol", "spread", "study", "suite", "sysid", "tracker", "validation")
     folders = [folder for folder in sorted(hydra_config.find_conf().iterdir()) if folder.is_dir() and folder.name not in others]
     groups = [[f"{folder.name}={path.stem}" for path in sorted(folder.glob("*.yaml")) if path.stem not in PARTS] for folder in folders]
-    apart = (*PLANNERS, *FOR_PLANNERS, "timing=waymax")  # not trained, or not with every action repeat; see below
+    apart = (*PLANNERS, *FOR_PLANNERS, *RATES, "timing=waymax")  # not trained, or not with every learner or action repeat; see below
     groups = [[option for option in options if option not in apart] for options in groups]
     return [[options[i % len(options)] for options in groups if options] for i in range(max(map(len, groups)))]
 
@@ -595,6 +596,11 @@ def builds(whole_config):
 @pytest.mark.parametrize("options", option_sets(), ids=lambda options: options[-1])
 def test_every_option_builds(options):
     builds(hydra_config.load_config("train", *options))
+
+
+@pytest.mark.parametrize("actions", RATES)
+def test_actions_that_are_rates_build(actions):
+    builds(hydra_config.load_config("train", actions, "observations=drive_bends"))
 
 
 def test_the_task_of_v_max_builds():
