@@ -102,8 +102,8 @@ def attack_world(
         return jax.lax.scan(run_round, begun, jnp.arange(settings.search.rounds + 1))[0]
 
     found = jax.vmap(search)(starts)
-    success, rounds = found[3].success, found[5]
-    first = jnp.argmin(jnp.where(success, rounds, settings.search.rounds + 1))
+    _, _, _, outcomes, _, ends = found
+    first = jnp.argmin(jnp.where(outcomes.success, ends, settings.search.rounds + 1))
     change, _, driven, outcome, plain, rounds = jax.tree.map(lambda leaf: leaf[first], found)
     return Attack(chosen, reasons, plain, move(change, problem, settings), driven, outcome, rounds)
 
