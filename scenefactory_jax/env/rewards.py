@@ -74,7 +74,7 @@ def bend_speed(
     *,
     limit_mps: Positive,
     look_ahead_m: Positive,
-    chord_m: Positive,
+    chord_m: Count,
     lateral_mps2: Positive,
     braking_mps2: Positive,
 ) -> Float[Array, " A"]:

@@ -4,7 +4,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from scenefactory_jax.core.geometry import cross, dot, heading_vector, safe_norm, to_frame
-from scenefactory_jax.core.schema import Positive
+from scenefactory_jax.core.schema import Count, Positive
 from scenefactory_jax.core.types import ROUTE_SPACING_M, Scene, State
 from scenefactory_jax.env import route_following
 from scenefactory_jax.env.bend_speed import find_bend_speed
@@ -71,13 +71,13 @@ def bend_speed(
     *,
     speed_scale_mps: Positive,
     look_ahead_m: Positive,
-    chord_m: Positive,
+    chord_m: Count,
     lateral_mps2: Positive,
     braking_mps2: Positive,
 ) -> Float[Array, "A 2"]:
     """The speed v with which the car can keep to the bends of its route ahead (`find_bend_speed`, which has the other arguments).
 
-    Columns: v / (scale + v), 1 without a bend or a route; by how much the car is faster than v, over `speed_scale_mps`, clamped to 1.
+    Columns: v / (scale + v), 1 without a route; by how much the car is faster than v, over `speed_scale_mps`, clamped to 1.
     """
     numbers = {"look_ahead_m": look_ahead_m, "chord_m": chord_m, "lateral_mps2": lateral_mps2, "braking_mps2": braking_mps2}
     slowest = find_bend_speed(scene, state, **numbers)
