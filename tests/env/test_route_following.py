@@ -126,15 +126,15 @@ def test_speed_before_lines_that_demand_a_stop(env):
 
 
 def test_speed_before_bends(env):
-    """A right angle 20 m ahead, 16 m before its chord of 4 m: 3.2 m/s there by 4 m/s^2, and 10.3 m/s here by braking of 3 m/s^2."""
+    """A right angle 20 m ahead: 3.2 m/s there by 4 m/s^2 and 90 degrees in 4 m, and 11.4 m/s here by braking of 3 m/s^2."""
     along = np.arange(41.0)
     corner = np.stack([np.minimum(along, 24.0), np.maximum(along - 24.0, 0.0)], axis=1)
-    speeds, allowed = [10.0, 12.0, 20.0], np.sqrt(16.0 / (np.pi / 2) + 2 * 3.0 * 16.0)
+    speeds, allowed = [10.0, 12.0, 20.0], np.sqrt(16.0 / (np.pi / 2) + 2 * 3.0 * 20.0)
     lines = [corner + np.array([0.0, 60.0 * row]) for row in range(3)] + [STRAIGHT - np.array([0.0, 20.0])]
     scene = routed_scene(lines, starts=[4.0, 4.0, 4.0, 4.0], speeds=[*speeds, 30.0])
     state, action = env.reset(jax.random.key(0), scene)[0], jnp.zeros((4, 3))
     result = jax.jit(env.step)(scene, state, action)[1]
-    numbers = {"look_ahead_m": 60.0, "chord_m": 4.0, "lateral_mps2": 4.0, "braking_mps2": 3.0}
+    numbers = {"look_ahead_m": 60.0, "chord_m": 4, "lateral_mps2": 4.0, "braking_mps2": 3.0}
     term = functools.partial(rewards.bend_speed, limit_mps=4.0, **numbers)
     expected = [*np.clip((np.array(speeds) - allowed) / 4.0, 0.0, 1.0), 0.0]
     np.testing.assert_allclose(jax.jit(term)(RewardInput(scene, state, action, state, result.metrics, result.events)), expected, atol=1e-4)

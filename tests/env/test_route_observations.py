@@ -99,9 +99,9 @@ def test_the_route_is_seen_from_the_car():
     assert not seen[1].any()  # no route
 
 
-@pytest.mark.parametrize(("arc", "room"), [(8.0, 48.0), (40.0, 16.0), (56.0, 0.0), (60.0, 0.0)])
+@pytest.mark.parametrize(("arc", "room"), [(8.0, 52.0), (40.0, 20.0), (56.0, 4.0), (60.0, 0.0)])
 def test_the_speed_for_the_corner_ahead(arc, room):
-    """Two chords of 4 m meet at the corner at metre 60: 4 m/s^2 by 90 degrees in 4 m, and braking of 3 m/s^2 before the first."""
+    """Two chords of 4 m meet at the corner at metre 60: 4 m/s^2 by 90 degrees in 4 m, and braking of 3 m/s^2 before it."""
     speed = np.sqrt(4.0 / (np.pi / 2 / 4.0) + 2 * 3.0 * room)
     seen = observe(arc=arc, place=(min(arc, 60.0), max(arc - 60.0, 0.0)))
     np.testing.assert_allclose(seen["bend_speed"][0], [speed / (10.0 + speed), max(-speed / 10.0, -1.0)], rtol=1e-4)
@@ -111,7 +111,8 @@ def test_the_speed_for_the_corner_ahead(arc, room):
 
 def test_behind_a_corner_and_at_the_end_of_a_route_no_bend_is_seen():
     for arc in (66.0, 94.0, 98.5, 100.0):
-        np.testing.assert_array_equal(observe(arc=arc, place=(60.0, arc - 60.0))["bend_speed"][0], [1.0, -1.0])
+        value, excess = np.asarray(observe(arc=arc, place=(60.0, arc - 60.0))["bend_speed"])[0]
+        assert value > 0.97 and excess == -1.0
 
 
 def test_behind_the_goal_the_end_of_the_route_takes_its_place():
