@@ -129,7 +129,7 @@ def trajectory_idm_traffic(
     def move(scene: Scene, state: TrackState, cars: Boxes, step: Int[Array, ""]) -> TrackState:
         if scene.traffic_log.kind.shape[0] == 0:
             return state
-        due = (step + jnp.arange(len(state.arc))) % hold == 0
+        due = -step % hold + hold * jnp.arange(-(-len(state.arc) // hold))
         boxes: Boxes = jax.tree.map(lambda a, b: jnp.concatenate([a, b]), scene.traffic, cars)
         moved = advance(scene, state, boxes, due, driving, dt=control_dt)
         begun = state.first <= find_row(scene, step + 1)
@@ -189,14 +189,14 @@ def _compare_with_first_agent(
     return known & alike & behind, known & near
 
 
-def make_track(log: TrafficLog, first: Int[Array, " O"]) -> Track:
-    """Joins the valid rows of the log, from `first` on, to lines."""
-    rows = jnp.arange(log.valid.shape[1])
-    known = log.valid & (rows >= first[:, None])
-    held = jnp.maximum(jax.lax.cummax(jnp.where(known, rows, -1), axis=1), first[:, None])
-    position = jnp.take_along_axis(log.position, held[..., None], axis=1)
+def make_track(log: TrafficLog, first: Int[Array, " O"], users: Int[Array, " D"]) -> Track:
+    """Joins the valid rows of the log of some road users, from `first` of each on, to lines."""
+    rows, first = jnp.arange(log.valid.shape[1]), first[users, None]
+    known = log.valid[users] & (rows >= first)
+    held = jnp.maximum(jax.lax.cummax(jnp.where(known, rows, -1), axis=1), first)
+    position = log.position[users[:, None], held]
     steps = safe_norm(position[:, 1:] - position[:, :-1])
-    return Track(position, jnp.take_along_axis(log.yaw, held, axis=1), jnp.pad(jnp.cumsum(steps, axis=1), ((0, 0), (1, 0))))
+    return Track(position, log.yaw[users[:, None], held], jnp.pad(jnp.cumsum(steps, axis=1), ((0, 0), (1, 0))))
 
 
 def interpolate_track(track: Track, arc: Float[Array, "O K"]) -> tuple[Float[Array, "O K 2"], Float[Array, "O K"]]:
@@ -215,42 +215,47 @@ def interpolate_track(track: Track, arc: Float[Array, "O K"]) -> tuple[Float[Arr
     return position + fraction[..., None] * (following - position), wrap_angle(yaw + fraction * turn)
 
 
-def advance(scene: Scene, state: TrackState, boxes: Boxes, due: Bool[Array, " O"], driving: TrackDriving, *, dt: float) -> TrackState:
-    """Moves the vehicles that react by one control step; those that are due choose a new action."""
-    log, law = scene.traffic_log, driving.law
-    track = make_track(log, state.first)
-    ahead = jnp.arange(int(driving.look_ahead_m // driving.point_m) + 1) * driving.point_m
-    arc = jnp.minimum(state.arc[:, None] + ahead, track.arc[:, -1:])
-    point, yaw = interpolate_track(track, arc)
-    ground = None if scene.edges.height is None else find_ground_by_lane(scene, point, yaw)
-    window = Window(point, arc, jnp.zeros(arc.shape, jnp.int32), ground and ground.height)
-    places = corridor.project_boxes(window, boxes)
-    strip = {
-        "size": log.size,
-        "margin_m": driving.strip_m,
-        "foresight_s": jnp.zeros(len(boxes.mass)),
-        "shift": jnp.zeros_like(places.offset),
-    }
-    found = corridor.find_obstacles(places, boxes, arc=state.arc, **strip)
-    own = jnp.arange(len(boxes.mass)) == jnp.arange(len(due))[:, None]
-    distance = jnp.where(jnp.isfinite(found.gap) & ~own, places.arc - state.arc[:, None], jnp.inf)  # between the centres
-    speed = KMH * jnp.broadcast_to(state.speed[:, None], distance.shape)
-    demand = jnp.max(idm_law.compute_interaction(speed, distance, KMH * found.speed, law), axis=1, initial=0.0)
-    target = jnp.full_like(state.speed, driving.target_kmh)
-    wanted = jnp.clip(idm_law.compute_acceleration(KMH * state.speed, target, demand, law), -1.0, 1.0)
+def advance(scene: Scene, state: TrackState, boxes: Boxes, due: Int[Array, " D"], driving: TrackDriving, *, dt: float) -> TrackState:
+    """Moves the vehicles that react by one control step; those in the rows `due` choose a new action. Rows beyond the last are none."""
     drives = state.reacts & state.entered
-    action = jnp.where(due & drives, wanted, state.action)
+    action = state.action.at[due].set(_choose_actions(scene, state, boxes, jnp.minimum(due, len(drives) - 1), driving), mode="drop")
+    action = jnp.where(drives, action, state.action)
     acceleration = jnp.where(action > 0, driving.full_throttle_mps2, driving.full_brake_mps2) * action
     new = jnp.maximum(state.speed + acceleration * dt, 0.0)
     way = 0.5 * (state.speed + new) * dt
     return state._replace(arc=jnp.where(drives, state.arc + way, state.arc), speed=jnp.where(drives, new, state.speed), action=action)
 
 
+def _choose_actions(scene: Scene, state: TrackState, boxes: Boxes, row: Int[Array, " D"], driving: TrackDriving) -> Float[Array, " D"]:
+    """Actions of some vehicles by MetaDrive's model, for the nearest box on their tracks."""
+    log, law = scene.traffic_log, driving.law
+    own, speed = state.arc[row], state.speed[row]
+    track = make_track(log, state.first, row)
+    ahead = jnp.arange(int(driving.look_ahead_m // driving.point_m) + 1) * driving.point_m
+    arc = jnp.minimum(own[:, None] + ahead, track.arc[:, -1:])
+    point, yaw = interpolate_track(track, arc)
+    ground = None if scene.edges.height is None else find_ground_by_lane(scene, point, yaw)
+    window = Window(point, arc, jnp.zeros(arc.shape, jnp.int32), ground and ground.height)
+    places = corridor.project_boxes(window, boxes)
+    strip = {
+        "size": log.size[row],
+        "margin_m": driving.strip_m,
+        "foresight_s": jnp.zeros(len(boxes.mass)),
+        "shift": jnp.zeros_like(places.offset),
+    }
+    found = corridor.find_obstacles(places, boxes, arc=own, **strip)
+    others = jnp.arange(len(boxes.mass)) != row[:, None]
+    distance = jnp.where(jnp.isfinite(found.gap) & others, places.arc - own[:, None], jnp.inf)  # between the centres
+    approach = KMH * jnp.broadcast_to(speed[:, None], distance.shape)
+    demand = jnp.max(idm_law.compute_interaction(approach, distance, KMH * found.speed, law), axis=1, initial=0.0)
+    wanted = idm_law.compute_acceleration(KMH * speed, jnp.full_like(speed, driving.target_kmh), demand, law)
+    return jnp.clip(wanted, -1.0, 1.0)
+
+
 def find_entering(scene: Scene, state: TrackState, boxes: Boxes, begun: Bool[Array, " O"], clearance: Clearance) -> Bool[Array, " O"]:
     """Mask of the vehicles that enter, of those whose track has begun: neither they nor another box would have to brake harder than
     `braking_mps2` to stay apart. Of two that have begun at one place the first enters."""
-    track = make_track(scene.traffic_log, state.first)
-    position, yaw = track.position[:, 0], track.yaw[:, 0]
+    position, yaw = (take_rows(column, state.first) for column in (scene.traffic_log.position, scene.traffic_log.yaw))
     size = scene.traffic_log.size + 2.0 * clearance.margin_m
     velocity = state.speed[:, None] * heading_vector(yaw)
     own = replace(scene.traffic, position=position, yaw=yaw, velocity=velocity, size=size, present=begun)
@@ -297,7 +302,7 @@ def _extend(boxes: Boxes, way: Float[Array, " B"]) -> Boxes:
 
 def read_boxes(log: TrafficLog, state: TrackState, logged: Boxes, end_m: float) -> Boxes:
     """Reads the boxes of the vehicles that react, and of the others from their log."""
-    track = make_track(log, state.first)
+    track = make_track(log, state.first, jnp.arange(len(state.first)))
     position, yaw = (values[:, 0] for values in interpolate_track(track, state.arc[:, None]))
     present = state.entered & (state.arc < track.arc[:, -1] - end_m)
     boxes = replace(
