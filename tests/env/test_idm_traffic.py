@@ -374,15 +374,20 @@ def test_trajectory_idm_follows_the_track_and_brakes():
     def drive(scene):
         def body(state, step):
             boxes = kind.read(scene, state, step)
-            return kind.advance(replace(scene, traffic=boxes), state, car_far_away(), step), boxes
+            moved = kind.advance(replace(scene, traffic=boxes), state, car_far_away(), step)
+            return moved, (boxes, moved.action != state.action)
 
         return jax.lax.scan(body, kind.init(jax.random.key(0), scene, jnp.int32(0)), jnp.arange(40))[1]
 
-    boxes = jax.device_get(drive(scene))
+    boxes, chooses = jax.device_get(drive(scene))
     np.testing.assert_array_equal(boxes.position[:, 0, 1], 0.0)
     assert boxes.position[-1, 0, 0] < 14.0 - LENGTH, "it stops behind the one that stands"
     assert boxes.present[:, 1].all()
     assert not boxes.present[-1, 2], "it leaves 2 m before its track's end"
+    hold = round(0.5 / DT)
+    for row in (0, 2):
+        chosen = np.flatnonzero(chooses[:, row])  # what differs from the action before
+        assert chosen.size and not np.any((chosen + row) % hold), "every half second, not all at once"
     behind = replace(scene, log=replace(scene.log, position=scene.log.position + jnp.array([20.0, -50.0]), yaw=0 * scene.log.yaw))
     metadrive = traffic.make(entry_of("trajectory_idm"), control_dt=DT)
     chosen = jax.jit(lambda scene: metadrive.init(jax.random.key(0), scene, jnp.int32(0)))(behind)
