@@ -189,14 +189,14 @@ def _compare_with_first_agent(
     return known & alike & behind, known & near
 
 
-def make_track(log: TrafficLog, first: Int[Array, " O"], users: Int[Array, " D"]) -> Track:
-    """Joins the valid rows of the log of some road users, from `first` of each on, to lines."""
-    rows, first = jnp.arange(log.valid.shape[1]), first[users, None]
-    known = log.valid[users] & (rows >= first)
-    held = jnp.maximum(jax.lax.cummax(jnp.where(known, rows, -1), axis=1), first)
-    position = log.position[users[:, None], held]
+def make_track(log: TrafficLog, first: Int[Array, " O"]) -> Track:
+    """Joins the valid rows of the log, from `first` on, to lines."""
+    rows = jnp.arange(log.valid.shape[1])
+    known = log.valid & (rows >= first[:, None])
+    held = jnp.maximum(jax.lax.cummax(jnp.where(known, rows, -1), axis=1), first[:, None])
+    position = jnp.take_along_axis(log.position, held[..., None], axis=1)
     steps = safe_norm(position[:, 1:] - position[:, :-1])
-    return Track(position, log.yaw[users[:, None], held], jnp.pad(jnp.cumsum(steps, axis=1), ((0, 0), (1, 0))))
+    return Track(position, jnp.take_along_axis(log.yaw, held, axis=1), jnp.pad(jnp.cumsum(steps, axis=1), ((0, 0), (1, 0))))
 
 
 def interpolate_track(track: Track, arc: Float[Array, "O K"]) -> tuple[Float[Array, "O K 2"], Float[Array, "O K"]]:
@@ -228,9 +228,9 @@ def advance(scene: Scene, state: TrackState, boxes: Boxes, due: Int[Array, " D"]
 
 def _choose_actions(scene: Scene, state: TrackState, boxes: Boxes, row: Int[Array, " D"], driving: TrackDriving) -> Float[Array, " D"]:
     """Actions of some vehicles by MetaDrive's model, for the nearest box on their tracks."""
-    log, law = scene.traffic_log, driving.law
+    law, log = driving.law, jax.tree.map(lambda leaf: leaf[row], scene.traffic_log)
     own, speed = state.arc[row], state.speed[row]
-    track = make_track(log, state.first, row)
+    track = make_track(log, state.first[row])
     ahead = jnp.arange(int(driving.look_ahead_m // driving.point_m) + 1) * driving.point_m
     arc = jnp.minimum(own[:, None] + ahead, track.arc[:, -1:])
     point, yaw = interpolate_track(track, arc)
@@ -238,7 +238,7 @@ def _choose_actions(scene: Scene, state: TrackState, boxes: Boxes, row: Int[Arra
     window = Window(point, arc, jnp.zeros(arc.shape, jnp.int32), ground and ground.height)
     places = corridor.project_boxes(window, boxes)
     strip = {
-        "size": log.size[row],
+        "size": log.size,
         "margin_m": driving.strip_m,
         "foresight_s": jnp.zeros(len(boxes.mass)),
         "shift": jnp.zeros_like(places.offset),
@@ -302,7 +302,7 @@ def _extend(boxes: Boxes, way: Float[Array, " B"]) -> Boxes:
 
 def read_boxes(log: TrafficLog, state: TrackState, logged: Boxes, end_m: float) -> Boxes:
     """Reads the boxes of the vehicles that react, and of the others from their log."""
-    track = make_track(log, state.first, jnp.arange(len(state.first)))
+    track = make_track(log, state.first)
     position, yaw = (values[:, 0] for values in interpolate_track(track, state.arc[:, None]))
     present = state.entered & (state.arc < track.arc[:, -1] - end_m)
     boxes = replace(
