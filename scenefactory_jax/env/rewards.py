@@ -141,6 +141,19 @@ def leader_speed(
     return jnp.clip((safe_norm(step.after.motion.velocity[:, :2]) - allowed) / limit_mps, 0.0, 1.0)
 
 
+def slow_progress(step: RewardInput, *, limit_mps: Positive, queue_m: NonNegative, control_dt: float) -> Float[Array, " A"]:
+    """By how much progress along the route is slower than `limit_mps`, as a fraction of it: 1 at rest, 2 at most for a car that backs.
+
+    0 without a route, and while a stop line with a red light is at most `queue_m` ahead. Where a collision costs what hundreds of metres
+    pay, a car that might touch another stands for ever. A price of standing alone would let cars rock back and forth for nothing.
+    """
+    state, time_s = step.after, step.after.step.astype(jnp.float32) * control_dt
+    lines = route_following.find_stop_lines(step.scene, state.agents, state.route.arc, time_s)
+    waits = jnp.any(lines.red & (lines.distance > 0) & (lines.distance <= queue_m), axis=1)
+    slow = jnp.clip(1.0 - step.metrics.route_progress / (limit_mps * control_dt), 0.0, 2.0)
+    return jnp.where(waits | ~route_following.find_routed(step.scene, state.agents), 0.0, slow)
+
+
 def against_traffic(step: RewardInput) -> Float[Array, " A"]:
     """1 while the car drives against its lane or its route (`step_metrics.route`)."""
     return step.metrics.wrong_way.astype(jnp.float32)

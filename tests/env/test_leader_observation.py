@@ -17,7 +17,7 @@ from scenefactory_jax.env import environment, observations, rewards
 
 CONFIG = load_config("train", "observations=drive_crossings")["observations"]
 ENTRY, NEAR = CONFIG["leader"], CONFIG["crossings"]
-GROUPS = observations.make({"leader": ENTRY, "near": NEAR, "nearest": {**NEAR, "count": 1}})
+GROUPS = observations.make({"leader": ENTRY, "near": NEAR, "nearest": {**NEAR, "count": 1}, "turning": {**NEAR, "turn_ahead_m": 20.0}})
 OBSERVE = jax.jit(lambda scene, state: observations.observe(scene, state, GROUPS))
 
 pytestmark = pytest.mark.usefixtures("quickly")
@@ -33,9 +33,9 @@ def boxes_of(*rows):
     return Boxes(table[:, :2], zero, table[:, 2], table[:, 3:], zero, jnp.tile(jnp.array([4.0, 2.0]), (len(table), 1)), zero, zero == 0)
 
 
-def place_agents(speeds, boxes, active=(True, True, True)):
+def place_agents(speeds, boxes, active=(True, True, True), lines=(EAST, EAST, NORTH)):
     """The scene and the state of agents at 10 and 30 m of the road east, and at 20 m of the road north."""
-    scene = replace(routed_scene([EAST, EAST, NORTH], starts=[10.0, 30.0, 20.0]), traffic=boxes_of(*boxes))
+    scene = replace(routed_scene(lines, starts=[10.0, 30.0, 20.0]), traffic=boxes_of(*boxes))
     agents, zero = scene.agents, jnp.zeros(3)
     place = jnp.concatenate([agents.position, zero[:, None]], axis=1)
     along = jnp.stack([jnp.cos(agents.yaw), jnp.sin(agents.yaw), zero], axis=1)
@@ -119,7 +119,8 @@ def test_a_world_without_routes_has_no_leaders():
     parts |= {"previous_action": jnp.zeros((3, 3)), "step": jnp.int32(0), "key": jax.random.key(0), "route": RouteState(zero, zero, none)}
     seen = OBSERVE(scene, State(**parts))
     np.testing.assert_array_equal(seen["leader"], [[0, 1, 0, 0]] * 3)
-    assert not seen["near"].mask.any() and not seen["near"].features.any()
+    for name, width in (("near", 14), ("turning", 16)):
+        assert seen[name].features.shape == (3, 16, width) and not seen[name].mask.any() and not seen[name].features.any()
 
 
 def squash(value, scale):
@@ -140,6 +141,16 @@ def test_neighbours_that_do_not_cross_in_time_or_at_all_have_no_crossing():
     assert slow[0, 0, 3] == 1.0 and not slow[0, 0, 10:].any()  # 5.7 s away
     along = observe_all([8.0, 8.0, 0.0], [], active=(True, True, False))["near"].features
     np.testing.assert_allclose(along[0, 0, 3:], [1.0, squash(20.0, 20.0), 0.0, 0.0, 1.0, 0.8, *[0.0] * 5], atol=1e-6)  # the one ahead
+
+
+def test_neighbours_that_stand_tell_where_their_routes_turn():
+    """The others turn by 90 degrees to the left 16 m ahead, by 45 to the right 15 m ahead; the box is no agent."""
+    left, right = [(0.0, 30.0), (46.0, 30.0), (46.0, 90.0)], [(50.0, -60.0), (50.0, -25.0), (90.0, 15.0)]
+    seen = observe_all([0.0, 0.0, 0.0], [(14.0, 1.0, 0.0, 0.0, 0.0)], lines=(EAST, left, right))
+    here, turns = seen["near"].features, seen["turning"].features
+    np.testing.assert_array_equal(turns[..., :-2], here)
+    np.testing.assert_allclose(turns[0, :3, -2:], [[0.0, 0.0], [0.5, 0.0], [0.0, 0.25]], atol=1e-5)
+    np.testing.assert_allclose(turns[1, :3, -2:], [[0.0, 0.0], [0.0, 0.0], [0.0, 0.25]], atol=1e-5)  # the box, the agent on the road east
 
 
 def test_boxes_that_stand_beside_the_route_come_after_those_that_come():

@@ -125,6 +125,25 @@ def test_speed_before_lines_that_demand_a_stop(env):
     np.testing.assert_allclose(jax.jit(term)(step), expected, atol=1e-5)
 
 
+def test_slow_progress_has_a_price_but_not_before_a_red_light(env):
+    """Progress in m/s; a light 8 m before the front."""
+    red, green, none = range(3)
+    cases = [(none, 0.0, 1.0), (none, 1.5, 0.25), (none, 2.0, 0.0), (none, 9.0, 0.0), (none, -1.0, 1.5), (none, -9.0, 2.0)]
+    cases += [(red, 0.0, 0.0), (red, -1.0, 0.0), (green, 0.0, 1.0)]
+    control, progress, expected = zip(*cases, strict=True)
+    controls = [((-40.0, 0.0), [(0.0, state)], np.inf) for state in (STOP, GO)]
+    lines = [STRAIGHT + np.array([0.0, 5.0 * row]) for row in range(len(cases))]
+    scene = routed_scene(lines, controls=controls, stops=[[(10.0, which)] if which != none else [] for which in control])
+    state, action = env.reset(jax.random.key(0), scene)[0], jnp.zeros((len(cases), 3))
+    result = jax.jit(env.step)(scene, state, action)[1]
+    step = RewardInput(scene, state, action, state, replace(result.metrics, route_progress=jnp.array(progress) / 30), result.events)
+    price = lambda queue_m: rewards.slow_progress(step, limit_mps=2.0, queue_m=queue_m, control_dt=1 / 30)  # noqa: E731
+    np.testing.assert_allclose(price(8.5), expected, atol=1e-6)
+    np.testing.assert_allclose(price(7.5), [*expected[:6], 1.0, 1.5, 1.0], atol=1e-6)  # too far from the line for its queue
+    unrouted = replace(step, after=replace(state, agents=replace(state.agents, route_end=state.agents.route_start)))
+    assert not rewards.slow_progress(unrouted, limit_mps=2.0, queue_m=8.5, control_dt=1 / 30).any()
+
+
 def test_speed_before_bends(env):
     """A right angle 20 m ahead: 3.2 m/s there by 4 m/s^2 and 90 degrees in 4 m, and 11.4 m/s here by braking of 3 m/s^2."""
     along = np.arange(41.0)

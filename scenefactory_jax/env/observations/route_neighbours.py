@@ -2,10 +2,11 @@
 
 import jax
 import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
 
-from scenefactory_jax.core.geometry import SMALLEST, dot, safe_norm
+from scenefactory_jax.core.geometry import SMALLEST, cross, dot, safe_norm
 from scenefactory_jax.core.schema import Count, NonNegative, Positive
-from scenefactory_jax.core.types import Boxes, Scene, SetObservation, State
+from scenefactory_jax.core.types import Boxes, Motion, Scene, SetObservation, State
 from scenefactory_jax.env import route_following
 from scenefactory_jax.env.leaders import find_along_route
 from scenefactory_jax.env.observations.column_bounds import (
@@ -39,6 +40,7 @@ def route_neighbours(
     size_scale_m: Positive,
     speed_scale_mps: Positive,
     turn_scale_radps: Positive,
+    turn_ahead_m: Positive | None = None,
 ) -> SetObservation:
     """The nearest other active cars and boxes as they lie to the agent's own route, and who is first where their ways cross.
 
@@ -47,6 +49,8 @@ def route_neighbours(
     heading to the route's, its speed along the route and to the left; 1 if it crosses the route at its present velocity within
     `foresight_s`, the length along the route to that place, the time t until it is there, and until the agent is at its own present speed,
     both as foresight / (foresight + t). Lengths l read l / (scale + |l|). Zeros for what does not hold; no rows without a route.
+    With `turn_ahead_m` two more: how far another agent's own route turns left, and right, within that length, as fractions of half a
+    circle, as drivers signal it; zeros for the traffic. Two that stand nose to nose have no velocities that tell their ways.
 
     Those that stand, more than `beside_m` from the route or not beside it at all, come after all others: parked cars do not take the rows
     of cars that come.
@@ -55,11 +59,11 @@ def route_neighbours(
     users = len(arc) + len(scene.traffic.present)
     others = route_following.find_routed(scene, agents)[:, None] & ~jnp.eye(len(arc), users, dtype=bool)
     if not corridor.has_routes(scene.routes):
-        return pad_rows(jnp.zeros((*others.shape, len(COLUMNS)))[:, :count], jnp.zeros_like(others)[:, :count], count)
+        empty = jnp.zeros((*others.shape, len(COLUMNS) + (0 if turn_ahead_m is None else 2)))
+        return pad_rows(empty[:, :count], jnp.zeros_like(others)[:, :count], count)
     boxes, window, places = find_along_route(scene, state, look_ahead_m=look_ahead_m, chord_m=chord_m)
-    apart = boxes.position - motion.position[:, None, :2]
     waits = (safe_norm(boxes.velocity) < standing_mps) & (~places.valid | (jnp.abs(places.offset) > beside_m))
-    distance = jnp.where(others & boxes.present, dot(apart, apart) + jnp.where(waits, LAST, 0.0), jnp.inf)
+    distance = _measure_distances(motion, boxes, others, waits)
     order = jnp.argsort(distance, axis=1)[:, :count]
     distance, near = jax.tree.map(lambda table: jnp.take_along_axis(table, order, axis=1), (distance, places))
     box: Boxes = jax.tree.map(lambda leaf: leaf[order], boxes)
@@ -69,10 +73,8 @@ def route_neighbours(
         jnp.ones_like(near.arc),
         compress_length(near.arc - arc[:, None], distance_scale_m),
         compress_length(near.offset, offset_scale_m),
-        near.sine,
-        near.cosine,
-        near.speed / speed_scale_mps,
-        near.drift / speed_scale_mps,
+        *(near.sine, near.cosine),
+        *(near.speed / speed_scale_mps, near.drift / speed_scale_mps),
     ]
     away, own = crossing.arc - arc[:, None], foresight_s * safe_norm(motion.velocity[:, :2])[:, None]  # m
     meeting = [
@@ -87,4 +89,19 @@ def route_neighbours(
         jnp.where(near.valid[..., None], jnp.stack(place, axis=-1), 0.0),
         jnp.where(jnp.isfinite(away)[..., None], jnp.stack(meeting, axis=-1), 0.0),
     ]
+    columns += [] if turn_ahead_m is None else [_measure_turns(scene, state, turn_ahead_m, users)[order]]
     return pad_rows(jnp.concatenate(columns, axis=-1), jnp.isfinite(distance), count)
+
+
+def _measure_distances(motion: Motion, boxes: Boxes, others: Bool[Array, "A U"], last: Bool[Array, "A U"]) -> Float[Array, "A U"]:
+    """Measures squared distances to boxes, by which they are ordered; inf for none."""
+    apart = boxes.position - motion.position[:, None, :2]
+    return jnp.where(others & boxes.present, dot(apart, apart) + jnp.where(last, LAST, 0.0), jnp.inf)
+
+
+def _measure_turns(scene: Scene, state: State, ahead_m: float, users: int) -> Float[Array, "U 2"]:
+    """Measures how far the routes of agents turn left and right within a length ahead, as fractions of half a circle; zeros without one."""
+    _, here = route_following.find_point(scene, state.agents.route, state.route.arc)
+    _, there = route_following.find_point(scene, state.agents.route, state.route.arc + ahead_m)
+    left = jnp.where(route_following.find_routed(scene, state.agents), jnp.arctan2(cross(here, there), dot(here, there)), 0.0) / jnp.pi
+    return jnp.pad(jnp.maximum(jnp.stack([left, -left], axis=1), 0.0), ((0, users - len(left)), (0, 0)))
