@@ -152,7 +152,7 @@ def find_point_at_distance(
     road: Road, running: Float[Array, " P"], distance: Float[Array, "*n"]
 ) -> tuple[Float[Array, "*n 2"], Float[Array, "*n"], Int[Array, "*n"], Float[Array, "*n"]]:
     """Computes point, yaw, polyline and arc length at a distance along all valid segments; `running` is their `cumulative_length`."""
-    row = jnp.clip(jnp.searchsorted(running, distance), 0, running.shape[0] - 1)
+    row = jnp.clip(jnp.searchsorted(running, distance, method="scan_unrolled"), 0, running.shape[0] - 1)  # no loop: few kernels
     along = distance - running[row] + road.half_length[row]  # from the midpoint
     along = jnp.clip(along, -road.half_length[row], road.half_length[row])
     direction = road.direction[row]

@@ -6,6 +6,7 @@ code builds a value, never where JAX rebuilds one.
 """
 
 import dataclasses
+import math
 import types
 import typing
 from collections.abc import Iterable
@@ -35,8 +36,8 @@ def tree_where(condition: Bool[Array, " rows"], chosen: T, other: T) -> T:
 
 def is_finite(tree: Any) -> Bool[Array, " rows"]:
     """Mask of the rows of a pytree, whose leaves all start with the same axis, in which every number and its square are finite."""
-    per_leaf = [jnp.all(jnp.abs(leaf) < LARGEST, axis=tuple(range(1, leaf.ndim))) for leaf in jax.tree.leaves(tree)]
-    return jnp.all(jnp.stack(per_leaf), axis=0)
+    columns = [(jnp.abs(leaf) < LARGEST).reshape(len(leaf), math.prod(leaf.shape[1:])) for leaf in jax.tree.leaves(tree)]
+    return jnp.all(jnp.concatenate(columns, axis=1), axis=1)
 
 
 def to_jax(tree: T) -> T:

@@ -181,35 +181,28 @@ def compute_forces(
         neighbours: they follow their path and feel no force. If their mass is finite, the force is limited to what gives them the car's
             speed within `momentum_transfer_s`, and ends after that time.
     """
-    touch = functools.partial(_compute_pair_force, law=law, height=height, step_s=step_s)
-    cars, (cars_axis, beside_axis), (count, objects) = _sanitize(cars, law.mass), axes, neighbours.rows.shape
-    total, torque, largest, contacts = jnp.zeros((count, 2)), jnp.zeros(count), jnp.zeros(count), jnp.zeros(count)
-    if objects:
-        first = jax.tree.map(lambda leaf: jnp.repeat(leaf, objects, axis=0), cars)
-        second = _sanitize(jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), neighbours.boxes), law.mass)
-        axis, pair_force, pair_torque, _ = jax.vmap(functools.partial(touch, limited=True))(beside_axis.ravel(), first, second)
-        beside_axis = axis.reshape(count, objects)
-        pair_force, pair_torque = pair_force.reshape(count, objects, 2), pair_torque.reshape(count, objects)
-        contacts = (safe_norm(pair_force) > 0.0).sum(1, dtype=jnp.float32)
-    if count > 1:
-        rows_first, rows_second = np.triu_indices(count, 1)
-        first, second = jax.tree.map(lambda leaf: leaf[rows_first], cars), jax.tree.map(lambda leaf: leaf[rows_second], cars)
-        previous = cars_axis[rows_first, rows_second]
-        axis, force, torque_first, torque_second = jax.vmap(functools.partial(touch, limited=False))(previous, first, second)
-        cars_axis = cars_axis.at[rows_first, rows_second].set(axis)
-        rows = _find_pairs(count)
-        contacts = contacts + jnp.tile(safe_norm(force) > 0.0, 2)[rows].sum(1, dtype=jnp.float32)
-        scale = _scale_of_many(jnp.maximum(contacts[rows_first], contacts[rows_second]))
-        force = scale[:, None] * force
-        total = jnp.concatenate([-force, force])[rows].sum(1)
-        torque = jnp.concatenate([scale * torque_first, scale * torque_second])[rows].sum(1)
-        largest = jnp.tile(safe_norm(force), 2)[rows].max(1)
-    if objects:
-        scale = _scale_of_many(contacts)[:, None]
-        force = scale[..., None] * pair_force
-        total, torque = total - force.sum(1), torque + (scale * pair_torque).sum(1)
-        largest = jnp.maximum(largest, safe_norm(force).max(1))
-    return Axes(cars_axis, beside_axis), total, torque, largest
+    count, objects = neighbours.rows.shape
+    beside = count * objects  # pairs of a car and a neighbour, before those of two cars: one call for both, of half the kernels
+    rows_first, rows_second, rows = _find_pairs(count, objects)
+    if not rows.size:
+        zero = jnp.zeros(count)
+        return axes, jnp.zeros((count, 2)), zero, zero
+    flat = jax.tree.map(lambda leaf: leaf.reshape(beside, *leaf.shape[2:]), neighbours.boxes)
+    bodies = _sanitize(jax.tree.map(lambda *leaves: jnp.concatenate(leaves), cars, flat), law.mass)
+    first, second = (jax.tree.map(lambda leaf: leaf[chosen], bodies) for chosen in (rows_first, rows_second))  # noqa: B023
+    pairs = rows_first[beside:], rows_second[beside:]
+    previous = jnp.concatenate([axes.beside.ravel(), axes.cars[pairs]])
+    touch = jax.vmap(functools.partial(_compute_pair_force, law=law, height=height, step_s=step_s))
+    axis, force, torque_first, torque_second = touch(previous, first, second, jnp.arange(len(rows_first)) < beside)
+
+    join = lambda of_first, of_second: jnp.concatenate([of_first, of_second[beside:]])[rows]  # noqa: E731  # [A, pairs of a car]
+    touching = safe_norm(force) > 0.0
+    contacts = jnp.pad(join(touching, touching).sum(1, dtype=jnp.float32), (0, beside))
+    scale = _scale_of_many(jnp.maximum(contacts[rows_first], contacts[rows_second]))
+    force, largest = scale[:, None] * force, safe_norm(scale[:, None] * force)
+    torque = join(scale * torque_first, scale * torque_second).sum(1)
+    found = Axes(axes.cars.at[pairs].set(axis[beside:]), axis[:beside].reshape(count, objects))
+    return found, join(-force, force).sum(1), torque, join(largest, largest).max(1)
 
 
 def _scale_of_many(contacts: Float[Array, "*n"]) -> Float[Array, "*n"]:
@@ -222,7 +215,7 @@ def _scale_of_many(contacts: Float[Array, "*n"]) -> Float[Array, "*n"]:
 
 
 def _compute_pair_force(
-    axis: Int[Array, ""], first: Boxes, second: Boxes, *, limited: bool, law: ContactLaw, height: float, step_s: float
+    axis: Int[Array, ""], first: Boxes, second: Boxes, limited: Bool[Array, ""], *, law: ContactLaw, height: float, step_s: float
 ) -> tuple[Int[Array, ""], Float[Array, "2"], Float[Array, ""], Float[Array, ""]]:
     """Computes the axis of a pair, the force on its second box (the first has the opposite), and the torques on both."""
     separation = compute_separation(first, second)
@@ -245,11 +238,10 @@ def _compute_pair_force(
     implicit = 1.0 + step_s * law.dissipation * spring.sum() * levers
     push = spring * jnp.maximum(1.0 + law.dissipation * closing, 0.0) / implicit
     reduced = 0.5 * law.mass * scale
-    if limited:
-        # per contact point; at a constant closing speed, the depth that it reaches in that time says when it is over
-        approach = jnp.maximum(closing, 0.0)
-        limit = jnp.where(depths < approach * law.momentum_transfer_s, 0.5 * reduced * approach / law.momentum_transfer_s, 0.0)
-        push = jnp.where(jnp.isfinite(second.mass), jnp.minimum(push, limit), push)
+    # limited per contact point; at a constant closing speed, the depth that it reaches in that time says when it is over
+    approach = jnp.maximum(closing, 0.0)
+    limit = jnp.where(depths < approach * law.momentum_transfer_s, 0.5 * reduced * approach / law.momentum_transfer_s, 0.0)
+    push = jnp.where(limited & jnp.isfinite(second.mass), jnp.minimum(push, limit), push)
     drag = jnp.clip(0.125 * reduced / step_s * sliding, -law.friction * push, law.friction * push)
     force = push[:, None] * normal - drag[:, None] * tangent
     return axis, force.sum(0), -cross(arm_first, force).sum(), cross(arm_second, force).sum()
@@ -283,10 +275,18 @@ def _sanitize(boxes: Boxes, mass: float) -> Boxes:
     return replace(clean, size=size, mass=jnp.where(valid, boxes.mass, mass), present=valid)
 
 
-def _find_pairs(count: int) -> Int[np.ndarray, "A partners"]:
-    """Finds the rows of each car's pairs in the table of all pairs' first bodies followed by all pairs' second bodies."""
-    bodies = np.concatenate(np.triu_indices(count, 1))
-    return np.stack([np.flatnonzero(bodies == car) for car in range(count)])
+def _find_pairs(count: int, objects: int) -> tuple[Int[np.ndarray, " P"], Int[np.ndarray, " P"], Int[np.ndarray, "A partners"]]:
+    """Finds the bodies of all pairs: of each car and its neighbours, which follow the cars, then of two cars.
+
+    Returns:
+        First and second bodies; and for each car the rows of its pairs in the table of all first bodies followed by the second ones of the
+        pairs of cars.
+    """
+    cars_first, cars_second = np.triu_indices(count, 1)
+    first = np.concatenate([np.repeat(np.arange(count), objects), cars_first])
+    second = np.concatenate([count + np.arange(count * objects), cars_second])
+    bodies = np.concatenate([first, cars_second])
+    return first, second, np.stack([np.flatnonzero(bodies == car) for car in range(count)])
 
 
 def compute_separation(first: Boxes, second: Boxes) -> Separation:

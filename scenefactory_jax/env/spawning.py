@@ -19,6 +19,7 @@ from scenefactory_jax.core.geometry import (
 )
 from scenefactory_jax.core.instantiate import check_range, instantiate
 from scenefactory_jax.core.pytree import is_finite, replace, tree_where
+from scenefactory_jax.core.random_index import draw_index
 from scenefactory_jax.core.schema import Bounds, ConfigError, Count, Fraction, NonNegative, Positive, Range, check_names
 from scenefactory_jax.core.types import ROUTE_SPACING_M, Agents, Boxes, Scene
 from scenefactory_jax.env import route_following
@@ -80,7 +81,7 @@ def admit_cars(agents: Agents) -> Agents:
 def mixed(key: PRNGKeyArray, scene: Scene, *, weights: list[float], samplers: list[Sampler]) -> Agents:
     """One of several samplers in each episode, at random with these weights."""
     choice_key, key = jax.random.split(key)
-    chosen = jax.random.choice(choice_key, len(samplers), p=jnp.array(weights) / sum(weights))
+    chosen = draw_index(choice_key, jnp.array(weights) / sum(weights))
     samples = [sampler(key, scene) for sampler in samplers]
     agents = samples[0]
     for index, sample in enumerate(samples):
@@ -114,7 +115,8 @@ def along_log(
     travelled = jnp.pad(jnp.cumsum(steps, axis=1), ((0, 0), (1, 0)))  # [A, L]
     length = travelled[:, -1:]
     begin = jax.random.uniform(place_key, (len(cars.present), candidates)) * jnp.maximum(length - travel_min_m, 0.0)
-    row = jax.vmap(functools.partial(jnp.searchsorted, side="right"))(travelled, begin) - 1  # the last row that is no further
+    find = functools.partial(jnp.searchsorted, side="right", method="scan_unrolled")  # no loop: few kernels
+    row = jax.vmap(find)(travelled, begin) - 1  # the last row that is no further
     row = jnp.maximum(row, jnp.argmax(log.valid, axis=1)[:, None])  # nor before the first valid row
     read = jax.vmap(lambda track, rows: track[rows])
     start = read(log.position, row)
@@ -217,7 +219,7 @@ def routes(
     row_key, begin_key, travel_key, rest_key, speed_key = jax.random.split(key, 5)
     usable_rows = table.drawn & (table.length >= travel_m[0])
     chance = usable_rows / jnp.maximum(jnp.sum(usable_rows), 1)
-    row = jax.random.choice(row_key, table.length.shape[0], (slots, candidates), p=chance)
+    row = draw_index(row_key, chance, (slots, candidates))
     travel = jax.random.uniform(travel_key, row.shape, minval=travel_m[0], maxval=travel_m[1])
     travel = jnp.minimum(travel, table.length[row])
     begin = jax.random.uniform(begin_key, row.shape) * (table.length[row] - travel)
@@ -247,23 +249,14 @@ def _choose(
     start: Float[Array, "A C 2"], goal: Float[Array, "A C 2"], usable: Bool[Array, "A C"], *, start_gap_m: float, goal_gap_m: float
 ) -> tuple[Array, Bool[Array, " A"]]:
     """Chooses for each slot in turn the first usable candidate that keeps its distance from the slots before it."""
-    slots = start.shape[0]
 
-    def fill_slot(slot, carry):
-        starts, goals, chosen, present = carry
-        near_start = jnp.any((safe_norm(start[slot][:, None] - starts) < start_gap_m) & present, axis=1)
-        near_goal = jnp.any((safe_norm(goal[slot][:, None] - goals) < goal_gap_m) & present, axis=1)
-        free = usable[slot] & ~near_start & ~near_goal
-        best = jnp.argmax(free)
-        return (
-            starts.at[slot].set(start[slot, best]),
-            goals.at[slot].set(goal[slot, best]),
-            chosen.at[slot].set(best.astype(jnp.int32)),
-            present.at[slot].set(free[best]),
-        )
+    def fill_slot(free, slot):
+        best = jnp.argmax(free[slot])
+        present = free[slot, best]
+        near = (safe_norm(start - start[slot, best]) < start_gap_m) | (safe_norm(goal - goal[slot, best]) < goal_gap_m)
+        return free & ~(near & present), (best.astype(jnp.int32), present)
 
-    empty = (jnp.zeros((slots, 2)), jnp.zeros((slots, 2)), jnp.zeros(slots, jnp.int32), jnp.zeros(slots, bool))
-    _, _, chosen, present = jax.lax.fori_loop(0, slots, fill_slot, empty)
+    _, (chosen, present) = jax.lax.scan(fill_slot, usable, jnp.arange(len(start)), unroll=16)  # few kernels
     return chosen, present
 
 

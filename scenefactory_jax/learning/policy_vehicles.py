@@ -15,6 +15,7 @@ from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 from scenefactory_jax.core.boxes import find_overlaps
 from scenefactory_jax.core.geometry import safe_norm
 from scenefactory_jax.core.pytree import replace
+from scenefactory_jax.core.random_index import draw_index
 from scenefactory_jax.core.schema import ConfigError
 from scenefactory_jax.core.track_interpolation import SNAP
 from scenefactory_jax.core.types import AgentLog, Agents, Boxes, Env, Observation, Policy, Scene, State
@@ -160,8 +161,8 @@ def init(
     starts, entry = make_starts(scene, index, row)
     starts = replace(starts, present=drives & (entry <= row))
     others = replace(logged, present=logged.present.at[index].set(logged.present[index] & ~drives))
-    driver = jax.random.choice(jax.random.fold_in(key, DRAW), len(drivers.weights), p=drivers.weights / jnp.sum(drivers.weights))
-    state = VehicleState(None, index, drives, entry, jnp.zeros_like(drives), key, driver.astype(jnp.int32))  # pyright: ignore[reportArgumentType]
+    driver = draw_index(jax.random.fold_in(key, DRAW), jnp.asarray(drivers.weights) / jnp.sum(drivers.weights))
+    state = VehicleState(None, index, drives, entry, jnp.zeros_like(drives), key, driver)  # pyright: ignore[reportArgumentType]
     inner = _make_inner_scene(scene, state, join(others, make_absent_boxes(len(scene.agents.present))), starts)
     state = state._replace(world=env.init_state(world_key, inner, step))
     _check_policy(drivers, jax.eval_shape(env.observe, inner, state.world))

@@ -22,8 +22,15 @@ Knots = Annotated[int, Bounds(min=2)]  # of the film; 16 give the exponential wi
 def advance_rain(weather: Weather, *, dt: float | Float[Array, ""]) -> Weather:
     """Computes the weather `dt` seconds later; without knots the film is constant."""
     rain = replace(weather.rain, now_s=weather.rain.now_s + dt)
-    film_mm = jnp.interp(rain.now_s, rain.time_s, rain.film_mm) if rain.time_s.shape[0] else weather.film_mm
-    return replace(weather, film_mm=film_mm, rain=rain)
+    return replace(weather, film_mm=_read_film(rain) if rain.time_s.shape[0] else weather.film_mm, rain=rain)
+
+
+def _read_film(rain: Rain) -> Float[Array, ""]:
+    """Reads the film between the knots; `jnp.interp` searches in a loop, whose steps are kernels of their own."""
+    after = jnp.clip(jnp.sum(rain.time_s <= rain.now_s), 1, len(rain.time_s) - 1)
+    start, end = rain.time_s[after - 1], rain.time_s[after]
+    part = jnp.clip((rain.now_s - start) / jnp.maximum(end - start, 1e-9), 0.0, 1.0)
+    return rain.film_mm[after - 1] + part * (rain.film_mm[after] - rain.film_mm[after - 1])
 
 
 def schedule(key: PRNGKeyArray, weather: Weather, *, time_s: list[NonNegative], film_mm: list[NonNegative]) -> Rain:

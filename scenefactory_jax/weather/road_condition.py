@@ -15,6 +15,7 @@ from jaxtyping import PRNGKeyArray
 from scenefactory_jax.core import schema
 from scenefactory_jax.core.instantiate import instantiate
 from scenefactory_jax.core.pytree import replace
+from scenefactory_jax.core.random_index import draw_index
 from scenefactory_jax.core.schema import ConfigError, NonNegative
 from scenefactory_jax.core.types import SURFACES, Scene, SurfaceName, Weather
 from scenefactory_jax.weather.friction import make_uniform
@@ -76,7 +77,7 @@ def sample_condition(key: PRNGKeyArray, scene: Scene, *, cases: list[Case]) -> W
     if sum(case.weight for case in cases) <= 0:
         raise ConfigError("weather.sampler.cases: expected a case with a positive weight, got none")
     weights = jnp.asarray([case.weight for case in cases], jnp.float32)
-    index = jax.random.choice(key, len(cases), p=weights / weights.sum())
+    index = draw_index(key, weights / weights.sum())
     film = jnp.asarray([case.film_mm for case in cases], jnp.float32)
     surface = jnp.asarray([SURFACES.index(case.surface) for case in cases], jnp.int32)
     return make_uniform(film[index], surface[index])

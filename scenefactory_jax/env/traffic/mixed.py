@@ -7,6 +7,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Int, PRNGKeyArray
 
 from scenefactory_jax.core.pytree import replace
+from scenefactory_jax.core.random_index import draw_index
 from scenefactory_jax.core.schema import ConfigError
 from scenefactory_jax.core.types import Boxes, Scene, Traffic
 
@@ -29,8 +30,8 @@ def mix_traffic(parts: list[Traffic], weights: list[float]) -> Traffic:
 
     def init(key: PRNGKeyArray, scene: Scene, step: Int[Array, ""]) -> MixedState:
         choice_key, key = jax.random.split(key)
-        chosen = jax.random.choice(choice_key, len(parts), p=jnp.array(weights) / sum(weights))
-        return MixedState(chosen.astype(jnp.int32), tuple(part.init(key, scene, step) for part in parts))
+        chosen = draw_index(choice_key, jnp.array(weights) / sum(weights))
+        return MixedState(chosen, tuple(part.init(key, scene, step) for part in parts))
 
     def advance(scene: Scene, state: MixedState, cars: Boxes, step: Int[Array, ""]) -> MixedState:
         states = [part.advance(scene, own, cars, step) for part, own in zip(parts, state.states, strict=True)]
