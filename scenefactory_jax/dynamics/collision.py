@@ -26,10 +26,11 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from scenefactory_jax.core import schema
-from scenefactory_jax.core.geometry import cross, dot, safe_norm
+from scenefactory_jax.core.geometry import safe_norm
 from scenefactory_jax.core.pytree import is_finite, replace
 from scenefactory_jax.core.schema import Bounds, ConfigError, NonNegative, Positive
 from scenefactory_jax.core.types import Boxes, Motion
+from scenefactory_jax.dynamics.planar import Planar, cross, dot, find_all, find_any, find_largest, pick, rotate_90, select
 
 OFF_CENTRE = 3.7  # effective mass of a contact at the middle of two cars' faces over that at their corners
 REPORT_S = 1e-3  # time step of forces that are reported and do not move cars
@@ -39,18 +40,17 @@ NO_AXIS = -1  # of boxes that have not been seen yet
 class Separation(NamedTuple):
     """Two boxes along their four candidate axes: the first box's two, then the second's."""
 
-    axes: Float[Array, "4 2"]
-    sign: Float[Array, "4"]  # of the second box's side
-    gap: Float[Array, "4"]  # m; below zero: overlap
-    closing: Float[Array, "4"]  # m/s
+    sign: tuple[Array, ...]  # of the second box's side
+    gap: tuple[Array, ...]  # m; below zero: overlap
+    closing: tuple[Array, ...]  # m/s
 
 
 class BoxContact(NamedTuple):
-    """Contact points of two boxes. The normal points from the first to the second."""
+    """The two contact points of two boxes. The normal points from the first to the second."""
 
-    normal: Float[Array, "2"]
-    points: Float[Array, "2 2"]
-    depths: Float[Array, "2"]  # m; below zero: apart
+    normal: Planar
+    points: tuple[Planar, Planar]
+    depths: tuple[Array, Array]  # m; below zero: apart
 
 
 class ContactState(NamedTuple):
@@ -221,33 +221,37 @@ def _compute_pair_force(
     separation = compute_separation(first, second)
     axis = select_axis(separation, axis)
     begin, touches = find_begin(separation, axis, step_s=step_s)
-    normal, points, depths = find_contact_points(axis, first, second, begin)
+    contact = find_contact_points(axis, first, second, begin)
     near = touches & first.present & second.present & (jnp.abs(first.elevation - second.elevation) < height)
+    normal, left = contact.normal, step_s - begin  # of the step
+    arms = [tuple(point - _place(box, begin) for box in (first, second)) for point in contact.points]
+    speeds = [_velocity_at(to_second, second) - _velocity_at(to_first, first) for to_first, to_second in arms]
+    closing, sliding = [-dot(speed, normal) for speed in speeds], [dot(speed, rotate_90(normal)) for speed in speeds]
 
-    arm_first, arm_second = points - (first.position + begin * first.velocity), points - (second.position + begin * second.velocity)
-    speed = _velocity_at(arm_second, second.velocity, second.yaw_rate) - _velocity_at(arm_first, first.velocity, first.yaw_rate)
-    tangent = _rotate_90(normal)
-    closing = -dot(speed, normal)
-    sliding = dot(speed, tangent)
-    left = step_s - begin  # of the step
-    depth = _average_depth(depths, closing, left) * jnp.where(near, left / step_s, 0.0)
+    acts = jnp.where(near, left / step_s, 0.0)
     scale = 2.0 / (law.mass / first.mass + law.mass / second.mass)
-    spring = 0.5 * law.stiffness * scale * depth
-    levers = 1.0 / first.mass + 1.0 / second.mass
-    levers = levers + _lever(arm_first, normal, first) + _lever(arm_second, normal, second)
-    implicit = 1.0 + step_s * law.dissipation * spring.sum() * levers
-    push = spring * jnp.maximum(1.0 + law.dissipation * closing, 0.0) / implicit
-    reduced = 0.5 * law.mass * scale
-    # limited per contact point; at a constant closing speed, the depth that it reaches in that time says when it is over
-    approach = jnp.maximum(closing, 0.0)
-    limit = jnp.where(depths < approach * law.momentum_transfer_s, 0.5 * reduced * approach / law.momentum_transfer_s, 0.0)
-    push = jnp.where(limited & jnp.isfinite(second.mass), jnp.minimum(push, limit), push)
-    drag = jnp.clip(0.125 * reduced / step_s * sliding, -law.friction * push, law.friction * push)
-    force = push[:, None] * normal - drag[:, None] * tangent
-    return axis, force.sum(0), -cross(arm_first, force).sum(), cross(arm_second, force).sum()
+    springs = [
+        0.5 * law.stiffness * scale * _average_depth(depth, along, left) * acts
+        for depth, along in zip(contact.depths, closing, strict=True)
+    ]
+    forces = []
+    for spring, depth, along, across, (to_first, to_second) in zip(springs, contact.depths, closing, sliding, arms, strict=True):
+        levers = 1.0 / first.mass + 1.0 / second.mass + _lever(to_first, normal, first) + _lever(to_second, normal, second)
+        implicit = 1.0 + step_s * law.dissipation * (springs[0] + springs[1]) * levers
+        push = spring * jnp.maximum(1.0 + law.dissipation * along, 0.0) / implicit
+        reduced = 0.5 * law.mass * scale
+        # limited per contact point; at a constant closing speed, the depth that it reaches in that time says when it is over
+        approach = jnp.maximum(along, 0.0)
+        limit = jnp.where(depth < approach * law.momentum_transfer_s, 0.5 * reduced * approach / law.momentum_transfer_s, 0.0)
+        push = jnp.where(limited & jnp.isfinite(second.mass), jnp.minimum(push, limit), push)
+        drag = jnp.clip(0.125 * reduced / step_s * across, -law.friction * push, law.friction * push)
+        forces.append(normal * push - rotate_90(normal) * drag)
+    torque_first = -(cross(arms[0][0], forces[0]) + cross(arms[1][0], forces[1]))
+    torque_second = cross(arms[0][1], forces[0]) + cross(arms[1][1], forces[1])
+    return axis, (forces[0] + forces[1]).stack(), torque_first, torque_second
 
 
-def _average_depth(depth: Float[Array, "2"], closing: Float[Array, "2"], seconds: Float[Array, ""]) -> Float[Array, "2"]:
+def _average_depth(depth: Array, closing: Array, seconds: Array) -> Array:
     """Computes the mean of max(0, depth) over a time with a constant closing speed, m."""
     after = depth + closing * seconds
     low, high = jnp.minimum(depth, after), jnp.maximum(depth, after)
@@ -255,9 +259,9 @@ def _average_depth(depth: Float[Array, "2"], closing: Float[Array, "2"], seconds
     return jnp.where(low >= 0.0, 0.5 * (low + high), partly)
 
 
-def _lever(arm: Float[Array, "2 2"], normal: Float[Array, "2"], box: Boxes) -> Float[Array, "2"]:
+def _lever(arm: Planar, normal: Planar, box: Boxes) -> Array:
     """Computes what rotation adds to the inverse mass of a contact point, 1/kg; a box has the inertia of a homogeneous one."""
-    inertia = box.mass * (box.size**2).sum() / 12.0
+    inertia = box.mass * (box.size[0] ** 2 + box.size[1] ** 2) / 12.0
     return cross(arm, normal) ** 2 / inertia
 
 
@@ -291,63 +295,74 @@ def _find_pairs(count: int, objects: int) -> tuple[Int[np.ndarray, " P"], Int[np
 
 def compute_separation(first: Boxes, second: Boxes) -> Separation:
     """Computes gaps and closing speeds of two boxes along their candidate axes."""
-    offset, speed = second.position - first.position, second.velocity - first.velocity
-    axes, other_axes = _axes(first.yaw), _axes(second.yaw)
-    candidates = jnp.concatenate([axes, other_axes])
-    reach = jnp.abs(candidates @ axes.T) @ (first.size / 2.0) + jnp.abs(candidates @ other_axes.T) @ (second.size / 2.0)
-    along = candidates @ offset
-    sign = jnp.where(along < 0.0, -1.0, 1.0)
-    return Separation(candidates, sign, jnp.abs(along) - reach, -sign * (candidates @ speed))
+    offset, speed = (Planar.read(b) - Planar.read(a) for a, b in ((first.position, second.position), (first.velocity, second.velocity)))
+    sides = [(_axes(box.yaw), box.size / 2.0) for box in (first, second)]
+    found = []
+    for axis in (axis for axes, _ in sides for axis in axes):
+        reach = [jnp.abs(dot(axis, axes[0])) * half[0] + jnp.abs(dot(axis, axes[1])) * half[1] for axes, half in sides]
+        along = dot(axis, offset)
+        sign = jnp.where(along < 0.0, -1.0, 1.0)
+        found.append((sign, jnp.abs(along) - (reach[0] + reach[1]), -sign * dot(axis, speed)))
+    return Separation(*zip(*found, strict=True))
 
 
 def select_axis(separation: Separation, previous: Int[Array, ""]) -> Int[Array, ""]:
     """Selects the axis on which two boxes touch last, or touched: see the module."""
-    apart = separation.gap > 0.0
-    seconds = jnp.where(separation.closing > 0.0, separation.gap / jnp.where(separation.closing > 0.0, separation.closing, 1.0), 1e6)
-    best = jnp.where(apart.any(), jnp.argmax(jnp.where(apart, seconds, -1.0)), jnp.argmax(separation.gap))
-    found = 2 * best + (separation.sign[best] < 0.0)
-    return jnp.where(apart.any() | (previous == NO_AXIS), found, previous)
+    apart = [gap > 0.0 for gap in separation.gap]
+    any_apart = find_any(apart)
+    seconds = [
+        jnp.where(gap > 0.0, jnp.where(closing > 0.0, gap / jnp.where(closing > 0.0, closing, 1.0), 1e6), -1.0)
+        for gap, closing in zip(separation.gap, separation.closing, strict=True)
+    ]
+    best = jnp.where(any_apart, find_largest(seconds), find_largest(separation.gap))
+    found = 2 * best + (pick(best, separation.sign) < 0.0)
+    return jnp.where(any_apart | (previous == NO_AXIS), found, previous)
 
 
 def find_begin(separation: Separation, axis: Int[Array, ""], *, step_s: float) -> tuple[Float[Array, ""], Bool[Array, ""]]:
     """Computes when in this step the contact of two boxes begins, s, and whether they touch in it at all."""
-    chosen = jnp.arange(4) == axis // 2
-    gap, closing = separation.gap[axis // 2], separation.closing[axis // 2]
+    gap, closing = pick(axis // 2, separation.gap), pick(axis // 2, separation.closing)
     begin = jnp.where(gap > 0.0, jnp.where(closing > 0.0, gap / jnp.where(closing > 0.0, closing, 1.0), step_s), 0.0)
     begin = jnp.clip(begin, 0.0, step_s)
-    beside = separation.gap - separation.closing * begin
-    return begin, (begin < step_s) & jnp.all((beside < 0.0) | chosen)
+    sides = enumerate(zip(separation.gap, separation.closing, strict=True))
+    beside = [(gap - closing * begin < 0.0) | (axis // 2 == row) for row, (gap, closing) in sides]
+    return begin, (begin < step_s) & find_all(beside)
 
 
 def find_contact_points(axis: Int[Array, ""], first: Boxes, second: Boxes, begin: Float[Array, ""]) -> BoxContact:
     """Computes the contact points of two boxes at `begin`, s; their reference face has the axis `axis` (see `ContactState`)."""
     best, sign = axis // 2, 1.0 - 2.0 * (axis % 2)
     axes, other_axes = _axes(first.yaw), _axes(second.yaw)
-    place, other_place = (box.position + begin * box.velocity for box in (first, second))
-    gap, half, other_half = other_place - place, first.size / 2.0, second.size / 2.0
-    normal = jnp.concatenate([axes, other_axes])[best] * sign
+    place, other_place = _place(first, begin), _place(second, begin)
+    gap, half, other_half = other_place - place, Planar.read(first.size / 2.0), Planar.read(second.size / 2.0)
+    normal = pick(best, (*axes, *other_axes)) * sign
 
     # the box of the axis has the reference face, the other box touches it with its nearest ("incident") face
-    pick = functools.partial(jnp.where, best < 2)
-    outward = pick(normal, -normal)
-    reference_half = pick(half, other_half)
-    front, side = reference_half[best % 2], reference_half[1 - best % 2]
-    incident_axes, incident_half = pick(other_axes, axes), pick(other_half, half)
-    facing = incident_axes @ outward
-    face = jnp.argmax(jnp.abs(facing))
-    towards = -jnp.where(facing[face] < 0.0, -1.0, 1.0) * incident_axes[face]
-    middle = pick(gap, -gap) + towards * incident_half[face]  # of the incident face, from the reference box's centre
-    along_face = incident_axes[1 - face] * incident_half[1 - face]
+    choose = functools.partial(select, best < 2)
+    outward = choose(normal, -normal)
+    reference = choose(half, other_half)
+    front, side = select(best % 2 == 0, (reference.x, reference.y), (reference.y, reference.x))
+    incident_axes, incident = choose(other_axes, axes), choose(other_half, half)
+    facing = [dot(axis, outward) for axis in incident_axes]
+    is_side = jnp.abs(facing[1]) > jnp.abs(facing[0])
+    (face, face_half), (along, along_half) = select(
+        is_side,
+        ((incident_axes[1], incident.y), (incident_axes[0], incident.x)),
+        ((incident_axes[0], incident.x), (incident_axes[1], incident.y)),
+    )
+    towards = face * -jnp.where(jnp.where(is_side, facing[1], facing[0]) < 0.0, -1.0, 1.0)
+    middle = choose(gap, -gap) + towards * face_half  # of the incident face, from the reference box's centre
+    along_face = along * along_half
 
     # clip the incident face at the reference face's sides, |w| <= side; it lies within 45 degrees across `outward`, so w_along is not 0
-    tangent = _rotate_90(outward)
-    w_middle, w_along = middle @ tangent, along_face @ tangent
+    tangent = rotate_90(outward)
+    w_middle, w_along = dot(middle, tangent), dot(along_face, tangent)
     w_along = jnp.where(jnp.abs(w_along) < 1e-6, 1e-6, w_along)
-    low, high = (-side - w_middle) / w_along, (side - w_middle) / w_along
-    ends = jnp.clip(jnp.stack([low, high]), -1.0, 1.0)
-    points = middle + ends[:, None] * along_face
-    depths = front - points @ outward
-    points = points + 0.5 * depths[:, None] * outward + pick(place, other_place)
+    ends = [jnp.clip((edge - w_middle) / w_along, -1.0, 1.0) for edge in (-side, side)]
+    points = [middle + along_face * end for end in ends]
+    depths = tuple(front - dot(point, outward) for point in points)
+    reference_place = choose(place, other_place)
+    points = tuple(point + outward * (0.5 * depth) + reference_place for point, depth in zip(points, depths, strict=True))
     return BoxContact(normal=normal, points=points, depths=depths)
 
 
@@ -355,21 +370,21 @@ def find_box_contact(first: Boxes, second: Boxes) -> BoxContact:
     """Computes the contact points of two boxes at this moment; depths are not positive if they do not overlap."""
     separation = compute_separation(first, second)
     contact = find_contact_points(select_axis(separation, jnp.int32(NO_AXIS)), first, second, jnp.float32(0.0))
-    overlap = jnp.all(separation.gap < 0.0)
-    return contact._replace(depths=jnp.where(overlap, contact.depths, jnp.minimum(contact.depths, 0.0)))
+    overlap = find_all([gap < 0.0 for gap in separation.gap])
+    return contact._replace(depths=tuple(jnp.where(overlap, depth, jnp.minimum(depth, 0.0)) for depth in contact.depths))
 
 
-def _axes(yaw: Float[Array, ""]) -> Float[Array, "2 2"]:
+def _axes(yaw: Float[Array, ""]) -> tuple[Planar, Planar]:
     """Computes unit vectors along a box's length and width."""
-    c, s = jnp.cos(yaw), jnp.sin(yaw)
-    return jnp.stack([jnp.stack([c, s]), jnp.stack([-s, c])])
+    along = Planar(jnp.cos(yaw), jnp.sin(yaw))
+    return along, rotate_90(along)
 
 
-def _rotate_90(v: Float[Array, "*shape 2"]) -> Float[Array, "*shape 2"]:
-    """Rotates by 90 degrees counter-clockwise."""
-    return jnp.stack([-v[..., 1], v[..., 0]], axis=-1)
+def _place(box: Boxes, seconds: Float[Array, ""]) -> Planar:
+    """Computes where a box's centre is after that time."""
+    return Planar.read(box.position) + Planar.read(box.velocity) * seconds
 
 
-def _velocity_at(arm: Float[Array, "2 2"], velocity: Float[Array, "2"], yaw_rate: Float[Array, ""]) -> Float[Array, "2 2"]:
-    """Computes the velocity of points at `arm` from a centre that moves and rotates."""
-    return velocity + yaw_rate * _rotate_90(arm)
+def _velocity_at(arm: Planar, box: Boxes) -> Planar:
+    """Computes the velocity of the point at `arm` from the centre of a box."""
+    return Planar.read(box.velocity) + rotate_90(arm) * box.yaw_rate

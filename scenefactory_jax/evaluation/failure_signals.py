@@ -165,9 +165,10 @@ def find_collision_partners(before: State, after: State, boxes: Boxes, against: 
     )
     agents = jax.tree.map(lambda leaf: leaf[:count], enlarged)
     contact = jax.vmap(lambda agent: jax.vmap(lambda user: find_box_contact(agent, user))(enlarged))(agents)
-    depth = jnp.where(users.present & (rows[:, None] != columns), contact.depths.max(-1), -jnp.inf)
+    depth = jnp.where(users.present & (rows[:, None] != columns), jnp.maximum(*contact.depths), -jnp.inf)
     partner = jnp.argmax(jnp.where(jnp.isfinite(depth), depth, -jnp.inf), axis=1).astype(jnp.int32)
-    normal, point = contact.normal[rows, partner], contact.points[rows, partner].mean(1)
+    middle = (contact.points[0] + contact.points[1]) * 0.5
+    normal, point = (vector.stack()[rows, partner] for vector in (contact.normal, middle))
 
     def speed_along_normal(index: Int[Array, " A"]) -> Float[Array, " A"]:
         arm = point - users.position[index]

@@ -86,7 +86,9 @@ def pairs(count=200, seed=3):
 def touching(position, yaw, half, other_position, other_yaw, other_half):
     """Contacts of pairs at rest, as numpy."""
     first, second = (boxes(p, yaw=y, size=2 * h) for p, y, h in ((position, yaw, half), (other_position, other_yaw, other_half)))
-    return (np.asarray(part) for part in touch(first, second))
+    contact = touch(first, second)
+    points = np.stack([point.stack() for point in contact.points], axis=1)
+    return np.asarray(contact.normal.stack()), points, np.stack(contact.depths, axis=1)
 
 
 def test_depth_and_normal_agree_with_brute_force():

@@ -11,6 +11,7 @@ from scenefactory_jax.core.geometry import dot, heading_vector
 from scenefactory_jax.core.pytree import unchecked
 from scenefactory_jax.core.types import Boxes
 from scenefactory_jax.dynamics.collision import NO_AXIS, compute_separation, select_axis
+from scenefactory_jax.dynamics.planar import pick
 from scenefactory_jax.evaluation.metrics.episode_record import EpisodeRecord
 
 CROSSING_COSINE = 0.8660254  # 30 degrees between headings, in either direction
@@ -51,17 +52,17 @@ def compute_impact(record: EpisodeRecord, touching: Bool[Array, "T O"]) -> Impac
     others, rows = record.others, touching.shape[0]
     hit = jnp.any(touching, axis=0)
     before = jnp.maximum(jnp.argmax(touching, axis=0) - 1, 0)
-    pick = jnp.arange(touching.shape[1])
-    valid = others.valid[pick, before]
+    users = jnp.arange(touching.shape[1])
+    valid = others.valid[users, before]
     before = jnp.where(valid, before, jnp.minimum(before + 1, rows - 1))  # of a road user that appears in contact
 
     def measure_closing(row: Int[Array, ""], other: Int[Array, ""]) -> Float[Array, ""]:
         car = _make_box(record.ego.position[row, :2], record.ego.yaw[row], record.ego.velocity[row], record.size)
         user = _make_box(others.position[other, row], others.yaw[other, row], others.velocity[other, row], others.size[other])
         separation = compute_separation(car, user)
-        return jnp.maximum(separation.closing[select_axis(separation, jnp.int32(NO_AXIS)) // 2], 0.0)
+        return jnp.maximum(pick(select_axis(separation, jnp.int32(NO_AXIS)) // 2, separation.closing), 0.0)
 
-    closing = jnp.where(hit, jax.vmap(measure_closing)(before, pick), 0.0)
+    closing = jnp.where(hit, jax.vmap(measure_closing)(before, users), 0.0)
     if record.mass is None or record.other_mass is None:
         weighted = jnp.zeros_like(closing)
     else:
