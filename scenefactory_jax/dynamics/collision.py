@@ -234,12 +234,10 @@ def _compute_pair_force(
         0.5 * law.stiffness * scale * _average_depth(depth, along, left) * acts
         for depth, along in zip(contact.depths, closing, strict=True)
     ]
-    forces = []
+    damping, reduced, forces = step_s * law.dissipation * (springs[0] + springs[1]), 0.5 * law.mass * scale, []
     for spring, depth, along, across, (to_first, to_second) in zip(springs, contact.depths, closing, sliding, arms, strict=True):
         levers = 1.0 / first.mass + 1.0 / second.mass + _lever(to_first, normal, first) + _lever(to_second, normal, second)
-        implicit = 1.0 + step_s * law.dissipation * (springs[0] + springs[1]) * levers
-        push = spring * jnp.maximum(1.0 + law.dissipation * along, 0.0) / implicit
-        reduced = 0.5 * law.mass * scale
+        push = spring * jnp.maximum(1.0 + law.dissipation * along, 0.0) / (1.0 + damping * levers)
         # limited per contact point; at a constant closing speed, the depth that it reaches in that time says when it is over
         approach = jnp.maximum(along, 0.0)
         limit = jnp.where(depth < approach * law.momentum_transfer_s, 0.5 * reduced * approach / law.momentum_transfer_s, 0.0)
