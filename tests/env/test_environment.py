@@ -174,7 +174,7 @@ def test_road_observation_is_a_scan_of_the_storage(env, two_cars):
 
 def test_encounters_by_hand_and_from_any_frame(env):
     """Head on, 1 m beside each other: centres are closest in 2 s, circles of the fronts meet before; a third car is far behind."""
-    numbers = scenefactory_jax.load_config("task", "observations=encounters")["observations"]["neighbours"]
+    numbers = scenefactory_jax.load_config("task", "observations=encounters")["observations"]["neighbours"] | {"body_gap_scale_m": 0.5}
     del numbers["_target_"]
 
     def observed(turn, shift):
@@ -190,9 +190,10 @@ def test_encounters_by_hand_and_from_any_frame(env):
     meet = (20 - 2 * 1.12 - np.sqrt(2.2**2 - 1)) / 10
     gap = np.hypot(20 - 2.24, 1.0) - 2.2
     expected = [squash(20, 20), squash(1, 20), -1.0, 0.0, 0.0, -1.0, 0.3, 0.8, 0.4, squash(gap, 2), 2 / 5, squash(1, 2), 5 / (5 + meet)]
-    np.testing.assert_allclose(rows.features[0, 0], expected, atol=1e-4)
+    bodies = [squash(20 - 4, 0.5), 1.0, 0.0, 1.0]  # of 4 x 2 m, side by side by half: straight ahead, at 10 m/s
+    np.testing.assert_allclose(rows.features[0, 0], [*expected, *bodies], atol=1e-4)
     np.testing.assert_allclose(rows.features[0, 1, :4], [-0.9, 0, -0.5, 0], atol=1e-4)
-    assert rows.features.shape == (3, 16, 13) and rows.mask.sum(axis=1).tolist() == [2, 2, 2] and not rows.features[0, 2:].any()
+    assert rows.features.shape == (3, 16, 17) and rows.mask.sum(axis=1).tolist() == [2, 2, 2] and not rows.features[0, 2:].any()
     moved = observed(0.9, [7.0, -3.0])
     np.testing.assert_allclose(moved.features, rows.features, atol=1e-3)
 

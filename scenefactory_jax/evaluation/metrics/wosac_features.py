@@ -13,6 +13,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from scenefactory_jax.core.geometry import cross, dot, heading_vector, safe_norm, wrap_angle
+from scenefactory_jax.core.rectangles import Placed, find_shortest_way
 from scenefactory_jax.evaluation.metrics.wosac_map_features import RoadMap, compute_road_edge_distances, find_light_violations
 
 DT_S = 0.1
@@ -95,28 +96,22 @@ def compute_box_distance(own: Neighbour, other: Neighbour) -> Float[Array, "*k"]
     radius, other_radius = (ROUNDING * jnp.min(each.size, axis=-1) / 2 for each in (own, other))
     half, other_half = own.size / 2 - radius[..., None], other.size / 2 - other_radius[..., None]
     apart, cos, sin = other.position - own.position, dot(own.facing, other.facing), cross(own.facing, other.facing)
-    gap, beyond = _compare(dot(apart, own.facing), cross(own.facing, apart), cos, sin, half, other_half)
-    other_gap, other_beyond = _compare(-dot(apart, other.facing), -cross(other.facing, apart), cos, -sin, other_half, half)
+    x, y = dot(apart, own.facing), cross(own.facing, apart)
+    gap = _measure_gap(x, y, cos, sin, half, other_half)
+    other_gap = _measure_gap(-dot(apart, other.facing), -cross(other.facing, apart), cos, sin, other_half, half)
+    way = find_shortest_way(half[..., 0], half[..., 1], Placed(x, y, cos, sin, other_half[..., 0], other_half[..., 1]))
     gap = jnp.maximum(gap, other_gap)
-    distance = jnp.where(gap > 0, jnp.sqrt(jnp.minimum(beyond, other_beyond)), gap)
+    distance = jnp.where(gap > 0, jnp.sqrt(way[0] ** 2 + way[1] ** 2), gap)
     return distance - radius - other_radius
 
 
-def _compare(
+def _measure_gap(
     x: Float[Array, "*n"], y: Float[Array, "*n"], cos: Float[Array, "*n"], sin: Float[Array, "*n"],
     half: Float[Array, "*a 2"], other_half: Float[Array, "*b 2"],
-) -> tuple[Float[Array, "*n"], Float[Array, "*n"]]:  # fmt: skip
-    """The largest gap along the axes of the first rectangle, and the least squared distance of the other's corners from it."""
-    length, width = other_half[..., 0], other_half[..., 1]
+) -> Float[Array, "*n"]:  # fmt: skip
+    """The largest gap along the axes of the first rectangle."""
     along, across = _extend(cos, sin, other_half)
-    gap = jnp.maximum(jnp.abs(x) - half[..., 0] - along, jnp.abs(y) - half[..., 1] - across)
-    beyond = jnp.full_like(gap, jnp.inf)
-    for front, left in ((1, 1), (1, -1), (-1, 1), (-1, -1)):
-        corner_x = x + front * length * cos - left * width * sin
-        corner_y = y + front * length * sin + left * width * cos
-        out_x, out_y = jnp.maximum(jnp.abs(corner_x) - half[..., 0], 0.0), jnp.maximum(jnp.abs(corner_y) - half[..., 1], 0.0)
-        beyond = jnp.minimum(beyond, out_x**2 + out_y**2)
-    return gap, beyond
+    return jnp.maximum(jnp.abs(x) - half[..., 0] - along, jnp.abs(y) - half[..., 1] - across)
 
 
 def _extend(cos: Float[Array, "*n"], sin: Float[Array, "*n"], half: Float[Array, "*b 2"]) -> tuple[Float[Array, "*n"], Float[Array, "*n"]]:
