@@ -5,6 +5,7 @@ import pytest
 from scenefactory_jax.cli import hydra_config, schema
 from scenefactory_jax.cli.evaluate import format_rerun_command
 from scenefactory_jax.core.instantiate import ConfigError
+from scenefactory_jax.env import environment, rewards
 
 
 def overrides_of(name, *words):
@@ -43,6 +44,16 @@ def test_groups_come_before_values_and_before_their_parts():
     assert words.index("traffic=trajectory_idm") < words.index("traffic.reactive=all")
     assert words.index("scenes/pack/routes=route100") < words.index("scenes.pack.traffic=64")
     assert overrides_of("trained") == []
+
+
+@pytest.mark.parametrize("name", ["strict", "paper", "route100", "conflict", "grip", "vmax", "nuplan", "wosac"])
+def test_a_policy_that_observes_its_reward_weights_can_be_evaluated(name):
+    """Its observation needs the ranges that it was trained with."""
+    words = ("reward=drive_conditioned", "observations=drive_conditioned", "scenes=town")
+    run = hydra_config.apply_overrides(hydra_config.load_config("train", *words), overrides_of(name))
+    held = rewards.hold_weights(run["reward"])
+    assert len(rewards.read_ranges(held)) == 8
+    environment.make_env({**run, "reward": held})
 
 
 def test_values_read_back_as_they_were():
