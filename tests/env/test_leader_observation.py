@@ -17,7 +17,8 @@ from scenefactory_jax.env import environment, observations, rewards
 
 CONFIG = load_config("train", "observations=drive_crossings")["observations"]
 ENTRY, NEAR = CONFIG["leader"], CONFIG["crossings"]
-GROUPS = observations.make({"leader": ENTRY, "near": NEAR, "nearest": {**NEAR, "count": 1}, "turning": {**NEAR, "turn_ahead_m": 20.0}})
+MORE = {"nearest": {**NEAR, "count": 1}, "turning": {**NEAR, "turn_ahead_m": 20.0}, "merging": {**NEAR, "merge_m": 2.5}}
+GROUPS = observations.make({"leader": ENTRY, "near": NEAR, **MORE})
 OBSERVE = jax.jit(lambda scene, state: observations.observe(scene, state, GROUPS))
 
 pytestmark = pytest.mark.usefixtures("quickly")
@@ -151,6 +152,17 @@ def test_neighbours_that_stand_tell_where_their_routes_turn():
     np.testing.assert_array_equal(turns[..., :-2], here)
     np.testing.assert_allclose(turns[0, :3, -2:], [[0.0, 0.0], [0.5, 0.0], [0.0, 0.25]], atol=1e-5)
     np.testing.assert_allclose(turns[1, :3, -2:], [[0.0, 0.0], [0.0, 0.0], [0.0, 0.25]], atol=1e-5)  # the box, the agent on the road east
+
+
+def test_neighbours_on_the_road_that_the_route_joins():
+    """A road 30 m ahead; a box on it comes from the left, in its middle or in the next lane. The route is read every 4 m: at 28 m, too."""
+    join, boxes = [(30.0, -40.0), (30.0, 0.0), (130.0, 0.0)], [(0.0, 0.4, 0.0, 10.0, 0.0), (-10.0, 4.0, 0.0, 10.0, 0.0)]
+    seen = observe_all([5.0, 0.0, 0.0], boxes, active=(True, False, False), lines=(join, EAST, NORTH))
+    here, merging = seen["near"].features[0, :2], seen["merging"].features[0, :2]
+    np.testing.assert_array_equal(merging[:, :-4], here)
+    assert not here[:, 10:].any()  # neither course crosses the route
+    expected = [1.0, squash(28.0, 20.0), 5 / (5 + 3.0), 25.0 / (25.0 + 28.0)]
+    np.testing.assert_allclose(merging[:, -4:], [expected, [0.0] * 4], atol=1e-6)
 
 
 def test_boxes_that_stand_beside_the_route_come_after_those_that_come():

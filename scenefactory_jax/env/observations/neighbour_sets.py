@@ -4,8 +4,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+from scenefactory_jax.core.boxes import Placed, find_shortest_way
 from scenefactory_jax.core.geometry import SMALLEST, cover_with_circles, dot, safe_norm, to_frame, wrap_angle
-from scenefactory_jax.core.rectangles import Placed, find_shortest_way
 from scenefactory_jax.core.schema import Count, Positive
 from scenefactory_jax.core.types import Motion, Scene, SetObservation, State
 from scenefactory_jax.env import surrogate_safety

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from scenefactory_jax.core import boxes as rectangles
-from scenefactory_jax.core.geometry import cross, dot, heading_vector, safe_norm
+from scenefactory_jax.core.geometry import SMALLEST, cross, dot, heading_vector, safe_norm
 from scenefactory_jax.core.types import ROUTE_SPACING_M, Boxes, Routes
 from scenefactory_jax.roadgraph.elevation import LEVEL_M
 
@@ -129,7 +129,7 @@ def find_extents(places: Projection, boxes: Boxes) -> tuple[Float[Array, "V B"],
 
 
 class Crossings(NamedTuple):
-    """Where straight courses of others first cross the routes of vehicles."""
+    """Where straight courses of others first cross the routes of vehicles, or come beside them."""
 
     arc: Float[Array, "V N"]  # along the route; inf: they do not
     time: Float[Array, "V N"]  # s until the other's centre is there; inf
@@ -156,6 +156,31 @@ def find_crossings(
     if window.height is not None:
         found &= _find_level(window.height, elevation)
     place = jnp.where(found, place, jnp.inf)
+    first = jnp.argmin(place, axis=2)[..., None]
+    nearest, time = (jnp.take_along_axis(table, first, axis=2)[..., 0] for table in (place, time))
+    return Crossings(nearest, jnp.where(jnp.isfinite(nearest), time, jnp.inf))
+
+
+def find_merges(
+    window: Window,
+    position: Float[Array, "V N 2"],
+    velocity: Float[Array, "V N 2"],
+    elevation: Float[Array, "V N"],
+    *,
+    arc: Float[Array, " V"],
+    foresight_s: float,
+    beside_m: float,
+) -> Crossings:
+    """Finds the first point of each route from `arc` on that the centre of another passes within `beside_m` and `foresight_s` at its
+    present velocity: where ways cross, where they join, or where the other is if it drives along the route."""
+    speed = safe_norm(velocity)[..., None]
+    apart, velocity = window.point[:, None] - position[:, :, None], velocity[:, :, None]
+    time = dot(apart, velocity) / jnp.maximum(speed, SMALLEST) ** 2
+    away = jnp.abs(cross(velocity, apart)) / jnp.maximum(speed, SMALLEST)
+    found = (speed > 0) & (time >= 0) & (time <= foresight_s) & (away <= beside_m) & (window.arc >= arc[:, None])[:, None]
+    if window.height is not None:
+        found &= _find_level(window.height, elevation)
+    place = jnp.where(found, window.arc[:, None], jnp.inf)
     first = jnp.argmin(place, axis=2)[..., None]
     nearest, time = (jnp.take_along_axis(table, first, axis=2)[..., 0] for table in (place, time))
     return Crossings(nearest, jnp.where(jnp.isfinite(nearest), time, jnp.inf))

@@ -12,8 +12,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+from scenefactory_jax.core.boxes import Placed, find_shortest_way
 from scenefactory_jax.core.geometry import cross, dot, heading_vector, safe_norm, wrap_angle
-from scenefactory_jax.core.rectangles import Placed, find_shortest_way
 from scenefactory_jax.evaluation.metrics.wosac_map_features import RoadMap, compute_road_edge_distances, find_light_violations
 
 DT_S = 0.1

@@ -3,14 +3,14 @@
 import jax
 import numpy as np
 
-from scenefactory_jax.core.rectangles import CORNERS, Placed, find_shortest_way
+from scenefactory_jax.core.boxes import CORNERS, Placed, find_shortest_way
 
 FAR, POINTS, STEP = 12.0, 201, 0.04  # m between points of the longest side
 
 
 def outline(placed: Placed) -> np.ndarray:
     """Points of a rectangle's outline, [M, 2]."""
-    corners = [np.array(sign) * [placed.half_length, placed.half_width] for sign in (CORNERS[0], CORNERS[1], CORNERS[3], CORNERS[2])]
+    corners = [np.array(sign) * [placed.half_length, placed.half_width] for sign in CORNERS]
     turn = np.array([[placed.cos, -placed.sin], [placed.sin, placed.cos]])
     sides = [a + np.linspace(0, 1, POINTS)[:, None] * (b - a) for a, b in zip(corners, [*corners[1:], corners[0]], strict=True)]
     return np.concatenate(sides) @ turn.T + [placed.x, placed.y]
