@@ -15,7 +15,7 @@ from scenefactory_jax.core import result_file
 from scenefactory_jax.core.instantiate import ConfigError
 from scenefactory_jax.data.bank import bank_index
 from scenefactory_jax.data.formats import reader_selection
-from scenefactory_jax.env import environment
+from scenefactory_jax.env import environment, rewards
 from scenefactory_jax.learning import run_paths
 
 TASK = tuple(group for group in environment.GROUPS if group != "termination")  # the termination is the protocol's
@@ -313,6 +313,7 @@ def _digest_program(config: Mapping[str, Any], settings: Mapping[str, Any], prot
     path, scenes = config["test_scenes"], settings["scenes"]
     heldout = scenes["heldout"] if path is None else None  # without a path: the recipe's own held-out scenes
     parts = {name: settings[name] for name in (*TASK, "policy")} | {"protocol": protocol, "settings": evaluation}
+    parts["reward"] = {name: settings["reward"][name] for name in rewards.read_ranges(settings["reward"])}  # no more of it is seen
     learner = settings.get("learner", {})  # policies of before have none
     parts |= {name: learner[name] for name in ACTOR if name in learner}
     parts |= {"scenes": digest_scenes(scenes, path), "heldout": heldout} | ({"scores": scores} if scores else {})

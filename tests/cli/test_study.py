@@ -559,6 +559,15 @@ def test_a_training_from_other_networks_is_another(tmp_path):
     assert plain.digest == null.digest != tuned.digest and plain.program == tuned.program
 
 
+def test_rewards_without_ranges_change_no_program_of_evaluations(tmp_path):
+    """No evaluation reads a reward; a policy may observe the weights of one with ranges."""
+    entry = toy(tmp_path, "train_scenes=train.bank", "test_scenes=test.bank", **ALONE, evaluation_overrides=["timing.episode_s=1"])
+    words = [], ["reward.goal.weight=9.0"], ["reward.goal.weight=[1.0,9.0]"]
+    plain, other, ranged = (study_plan.make({**entry, "common": one}) for one in words)
+    assert plain.trainings[0].program != other.trainings[0].program
+    assert plain.evaluations[0].program == other.evaluations[0].program != ranged.evaluations[0].program
+
+
 @pytest.mark.parametrize("is_bank", [True, False])
 def test_readers_of_formats_change_no_study_of_banks(tmp_path, is_bank):
     """A version that reads one format more finds what was trained before."""
