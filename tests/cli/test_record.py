@@ -20,7 +20,7 @@ SMALL = ("learner.horizon=8", "learner.buffer=120", "learner.learning_starts=8",
 
 
 def load(out, *overrides):
-    sizes = ("worlds=3", "samples.steps=8", f"samples.chunk={CHUNK}", "stream.workers=0")  # of 4 scenes: two batches
+    sizes = ("worlds=3", "samples.steps=8", f"samples.chunk={CHUNK}", "stream.workers=0", "stream.sample=4")  # of 4 scenes: two batches
     return load_config("record", "experiment=smoke", f"out={out}", *TASK, *sizes, *overrides)
 
 

@@ -35,7 +35,7 @@ CROSSER, PARKED, WALKER, FOLLOWER, ABSENT, TURNING = 1, 2, 3, 4, 5, 6
 
 
 def asked(path, out, *words):
-    small = [f"overrides=[{','.join(SMALL)}]", "solution.planners=[]", "worlds=2", "search.rounds=4"]
+    small = [f"overrides=[{','.join(SMALL)}]", "solution.planners=[]", "worlds=2", "search.rounds=4", "search.starts=[[0.0,0.0],[0.3,0.0]]"]
     return hydra_config.load_config("attack", "planner=log", f"scenes.path={path}", f"out={out}", *small, *words)
 
 
