@@ -17,6 +17,7 @@ from scenefactory_jax.cli import error_messages
 from scenefactory_jax.cli.train import train
 from scenefactory_jax.core import config as run_config
 from scenefactory_jax.core.instantiate import ConfigError
+from scenefactory_jax.core.pytree import replace
 from scenefactory_jax.data.bank import bank_index
 from scenefactory_jax.data.loading import scene_source
 from scenefactory_jax.evaluation import settings
@@ -33,9 +34,15 @@ pytestmark = pytest.mark.usefixtures("quickly")
 
 @pytest.fixture(scope="module")
 def place(tmp_path_factory):
-    """A folder as a user has one: a short run, a bank of another version, a reward of one's own, runs with it and with damage."""
+    """A folder as a user has one: a short run, a bank of another version, a reward of one's own, runs with it and with damage.
+
+    The run learnt nothing: no command reads what it learnt, and there is less to compile.
+    """
     folder = tmp_path_factory.mktemp("here")
-    train(smoke(folder / "runs" / "mine", "evaluation.enable=false", "iterations=1"))
+    config = smoke(folder / "runs" / "mine", "evaluation.enable=false", "iterations=1")
+    prepared = training_loop.prepare(config)
+    learns_nothing = lambda state, _: (replace(state, iteration=state.iteration + 1), {"steps/spawned": 1.0})  # noqa: E731
+    train(config, prepared=prepared._replace(trainer=prepared.trainer._replace(train_iteration=learns_nothing)))
     (folder / "old.bank").mkdir()
     (folder / "old.bank" / bank_index.INDEX).write_text(json.dumps({"format": bank_index.FORMAT, "schema": 2}))
     (folder / "my_reward.py").write_text(OWN_REWARD)
