@@ -35,7 +35,8 @@ CROSSER, PARKED, WALKER, FOLLOWER, ABSENT, TURNING = 1, 2, 3, 4, 5, 6
 
 
 def asked(path, out, *words):
-    small = [f"overrides=[{','.join(SMALL)}]", "solution.planners=[]", "worlds=2", "search.rounds=4", "search.starts=[[0.0,0.0],[0.3,0.0]]"]
+    small = [f"overrides=[{','.join(SMALL)}]", "solution.planners=[]", "solution.iterations=60", "worlds=3"]
+    small += ["search.rounds=4", "search.starts=[[0.0,0.0],[0.3,0.0]]", "costs.road_segments=128"]
     return hydra_config.load_config("attack", "planner=log", f"scenes.path={path}", f"out={out}", *small, *words)
 
 
@@ -235,6 +236,7 @@ def test_approach_and_repulsion_pull_and_push():
     assert float(slope) == pytest.approx(0.0, abs=1e-3) and float(deep) < 0.0, "a contact deep enough gains nothing"
 
 
+@pytest.mark.slow
 def test_articulated_cars_and_the_c_engine_touch_where_trajectories_do(bank, loaded):
     """Two pairs: one meets in the middle after 2.5 s, one passes 1 s apart."""
     task = Tasks(asked(bank.path, "x")).make_planner("expert", "observations.log.start_row=0", "traffic=none", attacks=False)
