@@ -24,10 +24,10 @@ demo: $(STAMP) ## a page of a policy of the package that drives among traffic; t
 	$(BIN)/python -m scenefactory_jax view run=drive overrides='[traffic=idm]' out=runs/drive.html
 	$(BIN)/python -m scenefactory_jax train experiment=demo
 
-test: $(STAMP) ## the fast tests
+test: $(STAMP) ## the fast tests, a chosen set
 	$(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder
 
-test-slow: $(STAMP) ## the tests that take minutes
+test-slow: $(STAMP) ## all other tests, before a release
 	XLA_FLAGS= $(BIN)/python -m pytest -m slow --ignore tests/test_digests.py
 	$(BIN)/python -m pytest -m slow tests/test_digests.py # recorded with the flags of the fast tests
 

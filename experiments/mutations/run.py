@@ -175,7 +175,8 @@ def first_failure(checkout: Path, tests: Sequence[str], compiled: Path) -> str |
     Raises:
         SystemExit: the tests do not run.
     """
-    call = [sys.executable, "-m", "pytest", "-x", "-n0", "-p", "no:cacheprovider", *(f"tests/{name}" for name in tests)]
+    named = ["-m", "not gpu"] * bool(tests)  # also the slow ones of what is named
+    call = [sys.executable, "-m", "pytest", "-x", "-n0", "-p", "no:cacheprovider", *named, *(f"tests/{name}" for name in tests)]
     own = {"PYTHONPATH": str(checkout), "PYTHONDONTWRITEBYTECODE": "1", "JAX_COMPILATION_CACHE_DIR": str(compiled)}
     done = subprocess.run(call, cwd=checkout, env=os.environ | own, capture_output=True, text=True)
     found = re.search(r"^(?:FAILED|ERROR) tests/(.+?)(?: - |$)", done.stdout, re.MULTILINE)

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from support.adapting import ALONE, SMOKE, scenes
+from support.choosing import slow_except
 
 from scenefactory_jax.adapters import bounds, episodes, flatten_observation, layout
 from scenefactory_jax.cli import hydra_config
@@ -31,7 +32,7 @@ def test_a_flat_observation_holds_every_group_where_its_layout_says():
     np.testing.assert_array_equal(jax.jit(flatten_observation)(many), np.stack([vector] * 7))
 
 
-@pytest.mark.parametrize("observe", ["paper", "lane_preview"])  # together all groups of the package
+@pytest.mark.parametrize("observe", slow_except(["paper", "lane_preview"], "paper"))  # together all groups of the package
 def test_bounds_hold_for_what_cars_see_before_anything_is_clipped(observe):
     settings = hydra_config.load_config(
         "train", SMOKE, f"observations={observe}", "dynamics=bicycle", "termination=goal_only", "scenes.pack.agents=4"
@@ -110,6 +111,7 @@ def test_a_step_of_an_episode_is_the_environments_own():
     np.testing.assert_array_equal(moment.active, after.active)
 
 
+@pytest.mark.slow  # test_environment has actions of several steps
 def test_a_step_is_all_control_steps_of_an_action():
     settings = hydra_config.load_config("train", SMOKE, "~observations.road", "~observations.neighbours")  # less to compile
     repeating = episodes.make_pool(settings, ["actions.action_repeat=3"], scenes(agents=4), alone=False)

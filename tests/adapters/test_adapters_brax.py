@@ -45,7 +45,8 @@ def test_a_step_keeps_the_shape_of_the_state_and_says_what_happened(env):
     assert state.done == 1 and state.metrics["events/road_edge_contact"] == 1 and step._cache_size() == 1
 
 
-@pytest.mark.parametrize("wrapping", [wrap, pytest.param(repeating, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("wrapping", [wrap, repeating])
 def test_time_that_is_up_is_a_truncation_and_what_comes_after_it_depends_on_the_wrapper(env, wrapping):
     braking = jnp.tile(jnp.array([0.0, 0.0, 1.0]), (WORLDS, 1))
     states, first = driven(wrapping(env, episode_length=env.episode_length), braking, steps=62)

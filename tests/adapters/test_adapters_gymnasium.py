@@ -87,6 +87,7 @@ def test_an_episode_ends_by_event_or_by_time_and_says_why(single):
     assert base._advance._cache_size() == base._begin._cache_size() == 1
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("mode", [AutoresetMode.SAME_STEP, AutoresetMode.NEXT_STEP])
 def test_the_vector_environment_is_gymnasiums_own_over_single_ones(mode, alone):
     envs = many(mode)
@@ -129,6 +130,7 @@ def test_the_same_seed_gives_the_same_bits_and_another_one_others():
     assert (runs[0] != runs[2]).any()
 
 
+@pytest.mark.slow
 def test_arrays_of_jax_stay_on_the_device_and_hold_what_those_of_numpy_hold():
     envs, plain = many(AutoresetMode.SAME_STEP, arrays="jax"), many(AutoresetMode.SAME_STEP)
     observed, _ = envs.reset(seed=2)
@@ -147,6 +149,7 @@ def test_arrays_of_jax_stay_on_the_device_and_hold_what_those_of_numpy_hold():
     assert last >= WORLDS and envs._step._cache_size() == 1
 
 
+@pytest.mark.slow
 def test_without_autoreset_worlds_begin_anew_where_a_mask_says():
     envs = many(AutoresetMode.DISABLED)
     before, _ = envs.reset(seed=0)

@@ -107,6 +107,7 @@ def test_the_page_marks_where_metrics_fail(plain):
     assert marked > 2
 
 
+@pytest.mark.slow  # test_noisy_start has the starts, test_compare the comparison
 def test_falls_of_a_noisy_start(plain, tmp_path, capsys):
     """Of the second planner, paired with the evaluation without noise; the files of the first are left out."""
     with quick_compilation():
@@ -127,6 +128,7 @@ def test_falls_of_a_noisy_start(plain, tmp_path, capsys):
             compare(hydra_config.load_config("compare", f"evaluations={words}", f"out={tmp_path}"))
 
 
+@pytest.mark.slow  # the digests hold bits of an evaluation
 def test_the_same_seed_gives_the_same_bits(plain, tmp_path):
     with quick_compilation():
         again = evaluate(asked(tmp_path, "planners=[random]")).records["whole, random"]

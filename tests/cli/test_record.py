@@ -66,6 +66,7 @@ def test_every_scene_is_driven_once_to_the_end_of_its_log(tmp_path):
     assert len(np.unique(places, axis=0)) == len(places) == 3 * 4 * 2
 
 
+@pytest.mark.slow  # test_train resumes, test_recorded_samples learns
 def test_a_killed_and_resumed_run_is_the_unbroken_one(folder, tmp_path):
     config = smoke(tmp_path / "whole", "learner=bc", *TASK, *SMALL, f"learner.samples={folder}", "iterations=4")
     prepared = training_loop.prepare(config)

@@ -173,6 +173,7 @@ def test_results_give_banks_by_their_names():
     assert named == {"rows": [{"overrides": ["stream.banks.a=${banks.womd}", "x=${banks.town}", "name=/data/towns"], "count": 2}]}
 
 
+@pytest.mark.slow
 def test_a_report_is_drawn_again_from_its_numbers(done, tmp_path):
     """With the interpretation that lies beside them now."""
     folder, result, _ = done
@@ -200,6 +201,7 @@ def test_a_report_of_a_validation_cut_says_so_and_how_to_repeat_it(done, tmp_pat
     assert "cut=" not in (folder / "out" / "navigation.md").read_text().split("How to repeat it")[1]
 
 
+@pytest.mark.slow
 def test_a_study_has_columns_of_its_own(done, tmp_path):
     folder, _, _ = done
     shutil.copytree(folder / "out", tmp_path / "out")
@@ -452,10 +454,11 @@ def steps_of(config):
 
 TIMED = {"vmax": "vmax", "plants": "vmax", "scenarionet": "scenarionet", "curriculum": "scenarionet"}  # study -> its protocol
 TIMED |= {"learners": "route100", "drive_rewards": "route100", "drive_collisions": "route100", "vmax_scenes": "vmax"}
-MANY = ("curriculum", "plants", "drive_rewards", "drive_collisions")  # environments
+MANY = tuple(name for name in TIMED if name != "learners")  # environments
 STREAMED = "recipe_drive"  # trains on a mixture of banks and generated scenes
 WHOLE = [name for name in STUDIES if name not in (*TIMED, STREAMED)]
 TWINS = {"rewards_laptop", "network_laptop"}  # nearly the same variants as another study, for a CPU
+LONG = {*TWINS, "floors", "friction", "recipe", "rewards"}  # many environments each
 
 
 @pytest.mark.parametrize("name", sorted(TWINS))
@@ -489,7 +492,7 @@ def entry_minutes(entry):
     return next(float(word.partition("=")[2]) for word in entry["study"]["common"] if word.startswith("minutes="))
 
 
-@pytest.mark.parametrize("name", [pytest.param(n, marks=[pytest.mark.slow] if n in TWINS else []) for n in WHOLE])
+@pytest.mark.parametrize("name", [pytest.param(n, marks=[pytest.mark.slow] if n in LONG else []) for n in WHOLE])
 def test_every_study_is_whole(name, tmp_path):
     """Every training and evaluation builds, and what is compared or drawn is evaluated."""
     entry = hydra_config.load_config("study", f"study={name}", f"runs={tmp_path}", "train_scenes=train.bank", "seeds=[0]")
@@ -582,7 +585,7 @@ def test_readers_of_formats_change_no_study_of_banks(tmp_path, is_bank):
 @pytest.mark.parametrize(
     ("name", "base"),
     [
-        ("network", "experiment=smoke"),
+        pytest.param("network", "experiment=smoke", marks=pytest.mark.slow),  # test_heads has the policy of the config
         pytest.param("recipe", "experiment=quick,worlds=2", marks=pytest.mark.slow),  # scenes of the recipe's size
         pytest.param("network_laptop", "experiment=laptop,scenes.take.count=1", marks=pytest.mark.slow),  # observations as in network
     ],

@@ -325,6 +325,7 @@ def test_both_protocols_and_the_same_records_twice(whole, tmp_path, undrawn_figu
     assert kept == ["agents-goal_only.csv", "agents-strict.csv"] and [file.name for file in tmp_path.iterdir()] == ["evaluation.json"]
 
 
+@pytest.mark.slow  # tests of planners and policies evaluate with overrides
 def test_other_settings_of_a_run(whole, tmp_path):
     short = "overrides=[timing.episode_s=1, weather.friction.mode=dynamic]"
     small = ["video.seconds=0.5", "video.panel=120", "video.worlds=1"]
@@ -334,6 +335,9 @@ def test_other_settings_of_a_run(whole, tmp_path):
     assert changed.report.read_text().startswith("# smoke: evaluation on scenes not seen in training\n")
     assert (tmp_path / "short" / "video.gif").is_file()
     assert hydra_config.read(whole.folder)["timing"]["episode_s"] == 2
+
+
+def test_wrong_overrides_of_a_run_are_named(whole, tmp_path):
     for override, message in {
         "overrides=[timing.episode=1]": "timing.episode: the run has no 'episode' there; valid: control_hz, episode_s, physics_hz",
         "overrides=[wether=wet]": "the run has no 'wether' there; valid: .*weather",
@@ -677,6 +681,9 @@ def test_a_protocol_decides_all_of_an_episode_but_what_the_policy_sees_and_does(
     assert (told["Weather"], told["Background traffic"]) == ("AC 0 mm", "none") and told["Dynamics"].startswith("`articulated")
 
 
+ALIKE = ("bicycle", "generalist_finetune", "laptop", "vmax")  # of the parts of others
+
+
 def test_episodes_are_described():
     tell = lambda *words: circumstances.describe(hydra_config.load_config("train", *words))  # noqa: E731
     found = tell("spawning=mixture", "weather=storm", "traffic=log_playback", "dynamics=bicycle", "scenes=town")
@@ -688,7 +695,7 @@ def test_episodes_are_described():
     assert circumstances.describe({"seed": 3}) == {}
 
 
-@pytest.mark.parametrize("name", names("experiment"))
+@pytest.mark.parametrize("name", [pytest.param(n, marks=[pytest.mark.slow] if n in ALIKE else []) for n in names("experiment")])
 def test_every_experiment_builds(name):
     builds(hydra_config.load_config("train", f"experiment={name}"))
     measured, recorded, trained = (hydra_config.load_config(command, f"experiment={name}") for command in ("benchmark", "record", "train"))

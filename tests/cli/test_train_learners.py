@@ -57,6 +57,7 @@ def test_its_policy_drives_background_traffic(run):
     assert jax.tree.structure(after) == jax.tree.structure(state) and after.drives.shape == (1,)
 
 
+@pytest.mark.slow  # test_planners has the expert
 def test_the_expert_of_a_run_follows_the_log(tmp_path):
     """Articulated cars or others, thirty times a second or ten: the expert is told by the run's config."""
     config = smoke(tmp_path / "run", "learner=bc", "spawning=logged", "actions=one_pedal_10hz", *SMALL)
@@ -82,6 +83,7 @@ def test_the_expert_of_a_run_follows_the_log(tmp_path):
 GAIL = ("learner=gail", "spawning=logged", "dynamics=bicycle", "learner.expert_steps=8", "learner.batch=64", "learner.buffer=512")
 
 
+@pytest.mark.slow  # test_adversarial trains with it
 def test_one_word_makes_gail(tmp_path):
     """The expert of the config drives, the discriminator reads the policy's observations. Traced, not compiled: tests/learning learns."""
     parts, state, after, metrics = trace(smoke(tmp_path / "run", *GAIL))
@@ -110,6 +112,7 @@ def trace(config):
     return parts, state, *jax.eval_shape(parts.trainer.train_iteration, state, stage)
 
 
+@pytest.mark.slow  # test_copo trains with it
 def test_one_word_makes_copo(tmp_path):
     """The learner asks the policy for three values, of which no evaluation reads one. It is traced, not compiled."""
     parts, state, after, metrics = trace(smoke(tmp_path / "run", "learner=copo"))

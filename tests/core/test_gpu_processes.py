@@ -6,6 +6,7 @@ import signal
 import time
 
 import pytest
+from support.choosing import slow_except
 
 from scenefactory_jax.core.instantiate import ConfigError
 from scenefactory_jax.core.parallel import gpu_processes
@@ -71,14 +72,17 @@ def test_an_error_is_raised_after_all_processes_have_ended(tmp_path, capfd):
     assert (tmp_path / "done").exists() and "this one fails" in capfd.readouterr().err
 
 
-@pytest.mark.parametrize("error", [ConfigError("worlds: expected an integer >= 1, got 0"), SceneError("no.bank: no such folder")])
+LACKING = pytest.param(SceneError("no.bank: no such folder"), marks=pytest.mark.slow)
+
+
+@pytest.mark.parametrize("error", [ConfigError("worlds: expected an integer >= 1, got 0"), LACKING])
 def test_a_mistake_of_the_user_is_raised_and_not_printed(error, capfd):
     with pytest.raises(ConfigError, match=str(error)):
         gpu_processes.run_on_gpus(mistaken, 2, error)
     assert "Traceback" not in capfd.readouterr().err
 
 
-@pytest.mark.parametrize("how", [signal.SIGTERM, signal.SIGKILL])
+@pytest.mark.parametrize("how", slow_except([signal.SIGTERM, signal.SIGKILL], signal.SIGKILL))
 def test_processes_end_with_the_first(how, tmp_path):
     """Told to terminate, it ends the others and does what is left to do with their notes; killed, it can do neither, and they end alone."""
     first = multiprocessing.get_context("spawn").Process(target=leading, args=(tmp_path,))
@@ -105,6 +109,7 @@ def test_more_processes_than_gpus_are_refused(tmp_path, monkeypatch):
         gpu_processes.run_on_gpus(work, 2, [], tmp_path)
 
 
+@pytest.mark.slow
 def test_processes_that_share_a_gpu_share_its_memory(tmp_path, monkeypatch):
     monkeypatch.setenv(gpu_processes.VISIBLE, "4,5")
     monkeypatch.delenv(gpu_processes.MEMORY, raising=False)
@@ -114,6 +119,7 @@ def test_processes_that_share_a_gpu_share_its_memory(tmp_path, monkeypatch):
         gpu_processes.run_on_gpus(surrounded, 5, tmp_path, per_gpu=2)
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not hasattr(os, "sched_getaffinity"), reason="this system does not bind processes to cores")
 def test_without_a_gpu_each_process_has_a_core(tmp_path, monkeypatch):
     monkeypatch.setenv("JAX_PLATFORMS", "cpu")

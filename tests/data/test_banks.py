@@ -22,6 +22,7 @@ import pyarrow as pa
 import pytest
 import shapely
 from support import eventful
+from support.choosing import slow_except
 from support.scene_banks import packed_scenes, stacked_scenes
 from support.scene_documents import (
     FORMATS,
@@ -434,7 +435,7 @@ def test_what_happens_to_a_reader_costs_its_file_alone(tmp_path, workers):
     assert sorted(path.name for path in opened.path.iterdir())[0] == "bank.json"  # no hidden leftovers
 
 
-@pytest.mark.parametrize(("number", "kept"), [(1, 0), (5, 4)])
+@pytest.mark.parametrize(("number", "kept"), slow_except([(1, 0), (5, 4)], (5, 4)))
 def test_a_killed_conversion_goes_on_where_it_stopped(tmp_path, number, kept):
     names = [f"s{index}" for index in range(7)]
     folder, out = streets(tmp_path / "in", *names), tmp_path / "bank"
@@ -514,6 +515,7 @@ def test_one_command_at_a_time_writes_a_bank(tmp_path, made):
         bank_reader.write(tmp_path / "file" / "bank", raws, settings={})
 
 
+@pytest.mark.slow
 def test_a_file_that_gave_nothing_is_read_again(tmp_path):
     folder, out, read = streets(tmp_path / "in", "a_killed", "b", "c_two", "d_broken"), tmp_path / "bank", []
     spread = functools.partial(spreads.local, workers=2, timeout_s=9.0)
@@ -526,6 +528,7 @@ def test_a_file_that_gave_nothing_is_read_again(tmp_path):
     assert conversion.convert(folder, out, **options(formats={"whole": reader})) == again and len(read) == 2
 
 
+@pytest.mark.slow
 def test_a_mistake_in_the_config_is_an_error_of_no_file(tmp_path):
     folder = streets(tmp_path / "in", "a", "b", "c")
     source = scene_source.open_files(folder, reader_selection.make(FORMATS))
@@ -629,6 +632,7 @@ def test_work_that_a_process_cannot_load_says_why(tmp_path, monkeypatch, over):
 # ---- real data
 
 
+@pytest.mark.slow
 def test_real_scenes_convert_alike_in_one_process_and_in_two(tmp_path, shared_data):
     for path in [*sorted((shared_data / "womd" / "train").iterdir())[:2], *(shared_data / "formats" / "nocturne_old").iterdir()]:
         (tmp_path / path.name).symlink_to(path)

@@ -16,6 +16,7 @@ def command(*overrides):
     return hydra_config.load_config("convert", "scenes=town", "progress=false", *overrides)
 
 
+@pytest.mark.slow
 def test_a_bank_of_generated_scenes_grows_with_their_count(tmp_path, capsys):
     out = tmp_path / "town"
     convert(command("scenes.count=1", f"out={out}"))

@@ -100,6 +100,7 @@ def real(shared_data, count=None):
             yield from reader_selection.read(path, formats)
 
 
+@pytest.mark.slow
 def test_real_scenes(shared_data):
     for raw in real(shared_data, 1):
         _, scenes = assert_same(raw)

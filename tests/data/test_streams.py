@@ -69,6 +69,7 @@ def swapped(trainer):
     return SimpleNamespace(before=before, after=kept, alone=bits(alone), fresh=bits(fresh), worlds=worlds, following=following, stage=stage)
 
 
+@pytest.mark.slow  # test_sharding swaps scenes
 def test_a_swap_is_a_fresh_start_in_those_scenes(swapped):
     state, stage = swapped.after
     same(jax.tree.map(lambda leaf: leaf[swapped.worlds], state.worlds), swapped.alone.worlds)
@@ -77,6 +78,7 @@ def test_a_swap_is_a_fresh_start_in_those_scenes(swapped):
     assert not np.asarray(state.worlds.state.step)[swapped.worlds].any()  # or the clock would cut lives short, which count as failures
 
 
+@pytest.mark.slow
 def test_a_swap_changes_no_other_world(swapped):
     others = np.setdiff1d(np.arange(WORLDS), swapped.worlds)
     rest = lambda tree: jax.tree.map(lambda leaf: leaf[others], tree)  # noqa: E731
@@ -88,6 +90,7 @@ def test_a_swap_changes_no_other_world(swapped):
         same(getattr(before, name), getattr(after, name))
 
 
+@pytest.mark.slow
 def test_records_count_from_the_swap_on(swapped):
     """Lives of three steps: five end in sixteen, of the two agents of each world; what began before the swap does not count."""
     assert (swapped.before[0].scene_stats.episodes == 10).all() and (swapped.before[0].scene_stats.successes == 10).all()
@@ -98,6 +101,7 @@ def test_records_count_from_the_swap_on(swapped):
     assert (np.delete(episodes, swapped.worlds) >= 20).all() and (np.asarray(swapped.following.scene_stats.successes) <= episodes).all()
 
 
+@pytest.mark.slow
 def test_nothing_compiles_twice(trainer, swapped):
     state, stage = jax.tree.map(jnp.copy, (swapped.following, swapped.stage))
     for world in range(3):

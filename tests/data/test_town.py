@@ -373,6 +373,7 @@ def test_realism_counts_what_is_there(scenes):
     assert samples["lane_m"] == pytest.approx(sum(np.linalg.norm(np.diff(xyz, axis=0), axis=1).sum() for xyz in lanes))
 
 
+@pytest.mark.slow  # test_operations compares banks
 def test_realism_writes_a_report(scenes, tmp_path):
     sets = {
         name: distribution_distance.collect(part, scene_size_m=200.0) for name, part in (("logged", scenes[:3]), ("town", scenes[3:6]))

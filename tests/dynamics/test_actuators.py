@@ -75,7 +75,7 @@ def stop(*, abs_enabled, steps=2400):
     return carry, locked
 
 
-@pytest.fixture(scope="module", params=[True, False], ids=["abs", "no abs"])
+@pytest.fixture(scope="module", params=[True, pytest.param(False, marks=pytest.mark.slow)], ids=["abs", "no abs"])
 def stopped(request):
     return request.param, *stop(abs_enabled=request.param)
 
@@ -114,6 +114,7 @@ def front_over_rear(car: CarParameters):
         yield share / load / ((1.0 - share) / (mass * G - load))
 
 
+@pytest.mark.slow  # a program more
 def test_a_car_steers_under_full_braking_with_the_controller_and_not_without():
     """A lane change of 3.5 m from 20 m/s on friction 0.3, straight after it: steered by the distance to the new lane."""
     ends = {}

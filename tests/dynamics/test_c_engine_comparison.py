@@ -10,6 +10,7 @@ from scenefactory_jax.dynamics.c_engine_comparison import REFERENCE, compare_sol
 SOLVERS = [("articulated",), pytest.param(("articulated", "mjx"), marks=pytest.mark.slow)]  # MJX's own takes long to compile
 
 
+@pytest.mark.slow  # test_dynamics has the C engine
 @pytest.mark.usefixtures("quickly")
 @pytest.mark.parametrize("names", SOLVERS, ids=" ".join)
 def test_solvers_agree_with_the_c_engine_and_with_each_other(names):

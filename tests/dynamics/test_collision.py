@@ -212,6 +212,7 @@ def test_a_broken_car_touches_nobody(leaf, bad):
         assert np.isfinite(a).all()
 
 
+@pytest.mark.slow
 def test_gradients_are_finite_in_a_heap_apart_and_exactly_aligned():
     def total(position, yaw, velocity, yaw_rate, cars, others):
         force, torque, largest = with_numbers()(replace(cars, position=position, yaw=yaw, velocity=velocity, yaw_rate=yaw_rate), others)
@@ -318,7 +319,10 @@ def collide(masses, speed, *, offset=0.0, driven=False):
     return trace, energy, largest
 
 
-@pytest.mark.parametrize("masses", [(80.0, 80.0), (MASS, 80.0), (MASS, MASS), (MASS, 4e4), (80.0, 4e4), (MASS, np.inf)], ids=str)
+ENDLESS = [pytest.param((MASS, np.inf), marks=pytest.mark.slow)]  # which is a program of its own
+
+
+@pytest.mark.parametrize("masses", [(80.0, 80.0), (MASS, 80.0), (MASS, MASS), (MASS, 4e4), (80.0, 4e4), *ENDLESS], ids=str)
 @pytest.mark.parametrize("offset", [0.0, 0.8])
 def test_collisions_of_any_masses_are_stable_and_lose_energy(masses, offset):
     walled = not np.isfinite(masses[1])
@@ -345,6 +349,7 @@ def test_a_person_hardly_slows_a_car_but_is_felt(speed):
     assert float(trace.velocity[-1, 0, 0]) < 0.0, "a wall throws it back"
 
 
+@pytest.mark.slow
 def test_three_contacts_on_one_car_have_the_strength_of_two():
     """A car with one in front, one behind and a short one beside it: two thirds of each force, on both of a pair."""
     cars = boxes([[0.0, 0.0], [3.99, 0.0], [-3.99, 0.0], [0.0, 1.99]], size=[[4.0, 2.0], [4.0, 2.0], [4.0, 2.0], [2.0, 2.0]])
@@ -353,6 +358,7 @@ def test_three_contacts_on_one_car_have_the_strength_of_two():
     np.testing.assert_allclose(among[0].sum(0), 0.0, atol=0.1)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("spread", [0.0, 1.5])
 def test_a_heap_flies_apart_and_does_not_blow_up(spread):
     """16 cars at one place, or nearly: what they start with inside each other is at most 64 MJ, 2 MJ a pair at two contacts' strength."""
@@ -419,6 +425,7 @@ def graze(phase, speed, aside, yaw):
     return jnp.linalg.norm(trace.velocity[-1], axis=-1), trace.yaw_rate[-1], largest.max()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("speed", "aside", "yaw"), [(15.0, 1.85, 0.0), (15.0, 1.9, 0.1), (20.0, 1.95, 0.2), (10.0, 2.3, 0.35), (60.0, 1.5, 0.5)]
 )
@@ -478,6 +485,7 @@ def test_a_thousand_fast_boxes_do_not_pass_through_each_other():
     check_that_nothing_passes_through(1000, 2)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(2))
 def test_the_order_of_two_cars_does_not_matter(seed):
     """A hit from start to end, and the same with the cars exchanged: axis, forces and motion."""
@@ -488,6 +496,7 @@ def test_the_order_of_two_cars_does_not_matter(seed):
     np.testing.assert_allclose(forward[0].yaw_rate, np.asarray(backward[0].yaw_rate)[:, ::-1], atol=0.02)
 
 
+@pytest.mark.slow
 def test_boxes_that_appear_inside_each_other_part():
     """Two cars at one place and heading, as after a bad spawn."""
     trace, _, _ = advance(boxes([[0.0, 0.0], [0.5, 0.3]]), 600)
@@ -495,6 +504,7 @@ def test_boxes_that_appear_inside_each_other_part():
     assert np.isfinite(position).all() and np.linalg.norm(position[-1, 1] - position[-1, 0]) > 2.0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("others", [0, 3])
 def test_absent_boxes_of_no_size_give_no_nan(others):
     """Slots without a car are zeros, as the loader pads them."""

@@ -88,6 +88,7 @@ def test_converges_to_the_c_engine(cases, truth):
     assert 0.2 < pressed.mean() < 0.98 and np.abs(force[-4:]).max() < 1e-6  # the last are in the air
 
 
+@pytest.mark.slow
 def test_two_steps_are_enough_for_most(cases, truth):
     """The cost is quadratic while no tyre lifts or lands. So two steps are the minimum but for the few cars whose set of tyres changes."""
     exact = np.abs(truth[0]).max(0)
@@ -117,6 +118,7 @@ def test_forces_never_pull_and_do_what_newton_says(cases):
     assert np.abs(left).max() < 1e-3 * np.asarray(force).max()
 
 
+@pytest.mark.slow
 def test_gradients_are_finite(cases):
     def total(push):
         return (solve((*cases[:2], push), iterations=1)[0] ** 2).sum()

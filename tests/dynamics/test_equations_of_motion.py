@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
+from support.choosing import slow_except
 from support.driving import CAR, DT, SOLVER, compiled_car, place
 from support.mjx_problem import columns, problem_of_mjx, random_states
 from support.running import quick_compilation
@@ -99,6 +100,7 @@ def broadcast(field):
     return [jnp.broadcast_to(leaf, (4,)) for leaf in jax.tree.leaves(field)]
 
 
+@pytest.mark.slow  # the C engine's forces below
 def test_the_problem_is_that_of_mjx_for_cars_that_differ(quick, crew, cases, stages):
     """A force is compared with the largest of its kind: MJX's own rounding is up to 1e-5 of that, see the next test."""
     found, pressed = jax.jit(jax.vmap(of_closed_form))(crew, *cases)
@@ -115,7 +117,7 @@ def test_the_problem_is_that_of_mjx_for_cars_that_differ(quick, crew, cases, sta
     assert not np.asarray(found.rows.weight)[~pressed[:, 0]].any()
 
 
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", slow_except(range(3), 0))
 def test_inertia_and_forces_are_the_c_engines(cases, seed):
     """In double precision, of cars that were compiled one by one."""
     car = random_car(seed)
@@ -281,6 +283,7 @@ def test_a_step_is_that_of_mjxs_newton(quick, moves, cases):
         assert np.median(np.abs(np.asarray(left) - np.asarray(right))) <= 1e-4 * max(np.abs(right).max(), 1e-3)
 
 
+@pytest.mark.slow
 def test_a_tyre_in_the_air_carries_nothing_however_its_wheel_turns(quick, cases):
     compiled, (command, push, _) = compiled_car(), cases[2]
     still = np.tile(compiled.rest_pose, (COUNT, 1)).astype(np.float32)

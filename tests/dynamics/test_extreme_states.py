@@ -28,11 +28,13 @@ def rows():
     return {row.name: row for row in extreme_states.run(entry(), extreme_states.CASES, seconds=4.0, heap=6, **SIZES, **BOUNDS)}
 
 
+@pytest.mark.slow  # test_dynamics drives at random to the end of an episode
 def test_every_extreme_stays_bounded(rows):
     assert len(rows) == len(extreme_states.CASES) + 1
     assert [row for row in rows.values() if not row.passed] == []
 
 
+@pytest.mark.slow
 def test_extremes_are_extreme(rows):
     """Each case does what its name says, or it would prove nothing."""
 

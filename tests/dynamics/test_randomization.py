@@ -163,6 +163,7 @@ def test_standing_height_is_where_the_c_engine_settles(seed):
         np.testing.assert_allclose(travel, settled[[7, 10, 13, 15]], atol=2e-3)
 
 
+@pytest.mark.slow  # test_dynamics has the C engine, tests above the fitted models
 def test_each_car_drives_as_in_the_c_engine_and_nothing_is_compiled_anew():
     """2 s of random controls: each car against its own compile in double precision."""
     speed, action = np.linspace(12, 4, 8), random_controls(7, 2, 15)
@@ -364,6 +365,7 @@ def test_a_run_can_be_amended_with_a_fleet():
     assert config["dynamics"]["randomization"] is None
 
 
+@pytest.mark.slow
 def test_sizes_of_real_scenes_build_and_step(shared_data):
     """Cars as large as the recording says, from its scenes to a second of driving."""
     scenes = load_config("convert", "scenes=womd", "scenes.pack.car_size_m=null")["scenes"]

@@ -106,6 +106,7 @@ def test_gradients_are_finite_at_rest():
         assert np.isfinite(slope(jnp.zeros(16).at[0].set(speed))).all()
 
 
+@pytest.mark.slow
 def test_each_car_has_its_own_and_drives_as_in_the_c_engine():
     rng = np.random.default_rng(2)
     several = []

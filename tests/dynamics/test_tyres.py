@@ -103,6 +103,7 @@ def test_slope_of_the_force_is_what_the_wheel_needs():
 # ---- the tyres under the car
 
 
+@pytest.mark.slow  # test_dynamics has cars that stand, test_grades grades
 def test_a_parked_car_on_a_grade_stands():
     """60 s under the force of a 10 % grade: along, aside, along on ice, aside on ice, between, and none. In 59 of them less than 1 mm."""
     weight = 0.0995 * WEIGHT
@@ -116,6 +117,7 @@ def test_a_parked_car_on_a_grade_stands():
     np.testing.assert_allclose(after.tyres.tangent.sum(1)[:2], weight, rtol=0.02)  # the tyres carry the car
 
 
+@pytest.mark.slow
 def test_a_steeper_grade_than_the_friction_holds_slides():
     after = move(place(COUNT), 240, brake=1.0, push=[0.2 * WEIGHT, 0.0], mu=[0.1, 0.15, 0.3, 0.5, 0.7, 1.0])
     assert (after.qvel[:2, 0] > 0.5).all() and np.abs(after.qvel[2:, 0]).max() < 1e-3
@@ -146,6 +148,7 @@ def slopes_of(advance):
     return jax.jit(jax.grad(total, argnums=(0, 1, 2)))(carry, command, jnp.full((COUNT, 4), 0.7))
 
 
+@pytest.mark.slow
 def test_slopes_of_the_forces_are_finite():
     compiled = compiled_car()
 

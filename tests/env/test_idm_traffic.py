@@ -206,6 +206,7 @@ def test_a_stop_sign_is_served_once():
     assert (states.phase[:, 0] == idm.GONE).any()
 
 
+@pytest.mark.slow
 def test_vehicles_brake_for_those_that_stand_walk_or_cut_in():
     stands = world({"route": "east", "arc": 50, "speed": 10.0}, {"at": [0.0, 0.0]})
     states, boxes = run(stands)
@@ -278,6 +279,7 @@ def test_vehicles_enter_at_their_time_where_there_is_room():
     assert not boxes.present[:, 1].any(), "its place is taken by one that stands"
 
 
+@pytest.mark.slow
 def test_routes_end_as_the_config_says():
     scene = world({"route": "east", "arc": 150, "speed": 8.0})
     states, boxes = run(scene, at_end="restart")
@@ -394,6 +396,7 @@ def test_trajectory_idm_follows_the_track_and_brakes():
     assert chosen.reacts.tolist()[:3] == [True, False, False], "the first agent is at (20, 0): only the first is behind it within 15 m"
 
 
+@pytest.mark.slow
 def test_trajectory_idm_enters_where_there_is_room_and_walkers_wait():
     """A vehicle whose track begins at 0.5 s, 8 m behind a car, and a pedestrian whose way another blocks; the cars leave after 1.5 s."""
     scene = world(

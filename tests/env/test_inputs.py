@@ -208,6 +208,7 @@ def test_a_state_of_other_agents_is_refused_and_whole_numbers_are_an_action(env,
     assert [leaf.dtype for leaf in jax.tree.leaves(after)] == [leaf.dtype for leaf in jax.tree.leaves(state)]
 
 
+@pytest.mark.slow
 def test_scenes_may_be_closed_over(env, given, drive):
     """numpy's and JAX's arrays, with cells and without, whatever is mapped over."""
     plain = jax.tree.map(lambda leaf: np.stack([leaf, leaf]), street())

@@ -122,6 +122,7 @@ def test_each_bound_of_comfort_that_is_left_counts():
     assert found(history=faster)["violations"] == pytest.approx(-1.0)
 
 
+@pytest.mark.slow
 def test_metadrive_by_hand():
     reward = lambda name="metadrive", **changes: terms(name, **changes)["metadrive"]  # noqa: E731
     assert reward() == pytest.approx(0.5, abs=1e-5)

@@ -90,6 +90,7 @@ def test_the_observation_shows_the_weights_from_minus_1_to_1(driven):
         np.testing.assert_allclose(observation["reward_weights"], expected * moment.active[:, None], atol=1e-5)
 
 
+@pytest.mark.slow
 def test_an_evaluation_holds_the_middle_or_the_weight_that_is_given():
     held = rewards.hold_weights(with_ranges(goal={"held": 55.0})["reward"])
     assert {name: held[name]["held"] for name in RANGES} == {"goal": 55.0, "progress": 2.0, "idle": -1.0}

@@ -106,6 +106,7 @@ def test_a_stop_sign_asks_for_standing_before_it(glide):
     assert not np.asarray(moving.route.stood)[0], "the next sign asks anew"
 
 
+@pytest.mark.slow
 def test_speed_before_lines_that_demand_a_stop(env):
     """Fronts 8 m before the line, that of the last one behind it: braking of 4 m/s^2 stops from 8 m/s."""
     sign, red, green = range(3)
@@ -125,6 +126,7 @@ def test_speed_before_lines_that_demand_a_stop(env):
     np.testing.assert_allclose(jax.jit(term)(step), expected, atol=1e-5)
 
 
+@pytest.mark.slow
 def test_slow_progress_has_a_price_but_not_before_a_red_light(env):
     """Progress in m/s; a light 8 m before the front."""
     red, green, none = range(3)
@@ -144,6 +146,7 @@ def test_slow_progress_has_a_price_but_not_before_a_red_light(env):
     assert not rewards.slow_progress(unrouted, limit_mps=2.0, queue_m=8.5, control_dt=1 / 30).any()
 
 
+@pytest.mark.slow
 def test_speed_before_bends(env):
     """A right angle 20 m ahead: 3.2 m/s there by 4 m/s^2 and 90 degrees in 4 m, and 11.4 m/s here by braking of 3 m/s^2."""
     along = np.arange(41.0)
@@ -159,6 +162,7 @@ def test_speed_before_bends(env):
     np.testing.assert_allclose(jax.jit(term)(RewardInput(scene, state, action, state, result.metrics, result.events)), expected, atol=1e-4)
 
 
+@pytest.mark.slow
 def test_a_line_is_passed_late_at_yellow(env):
     """Fronts 0.1 m before the line; lights yellow for 1.5 s and 0.5 s. By 4 m/s^2 a car of 11 m/s could have stopped 1.375 s ago."""
     old, new, red = range(3)

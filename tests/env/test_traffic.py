@@ -197,6 +197,7 @@ def test_neighbours_and_ttc_know_the_others(street, config):
     assert float(metrics.drac[0]) > 0.9 and CIRCLES["spacing_limit_m"] == 1.3
 
 
+@pytest.mark.slow
 def test_ignored_others_change_no_bit_and_their_order_changes_nothing(street, config):
     bare = replace(street, traffic_log=track_interpolation.make_empty_log(21))
     ignored = build_env(config)
@@ -210,6 +211,7 @@ def test_ignored_others_change_no_bit_and_their_order_changes_nothing(street, co
         np.testing.assert_array_equal(a, b)
 
 
+@pytest.mark.slow
 def test_random_starts_and_respawns_keep_clear_of_boxes():
     x = np.arange(-60, 60.1, 0.5)
     scene = scene_of(np.zeros((6, 2)), np.ones((6, 2)))
@@ -243,6 +245,7 @@ def test_a_car_that_drives_into_a_parked_one_has_collided():
     assert when == pytest.approx(gap / 10 * 30, abs=1.5) and not state.active[0] and state.active[1]
 
 
+@pytest.mark.slow
 def test_a_real_car_stops_at_a_wall_and_drives_on_past_a_person():
     """Four articulated cars 500 m apart: one against a parked car, one against a person, one under a drone, the last free."""
     f, lanes = jnp.float32, 500.0 * np.arange(4)
@@ -366,6 +369,7 @@ def assert_sound(packed):
     assert not len(people) or np.median(people) < 1.1  # one of them may carry something
 
 
+@pytest.mark.slow
 def test_real_scenes_have_others(shared_data):
     packed = real(shared_data, 4)
     assert_sound(packed)

@@ -335,6 +335,7 @@ def test_missing_parts():
     assert "nuplan_comfort" not in short
 
 
+@pytest.mark.slow
 def test_no_friction_and_no_masses():
     record = make_record(drive(), [(VEHICLE, drive(6.0, x=8.0), CAR)], friction_utilization=None, mass=None, other_mass=None)
     shapes = jax.eval_shape(lambda one: measure_steps(one, dt=DT, surrogates=SURROGATES), record)

@@ -259,6 +259,7 @@ def test_definitions_name_the_numbers(played, settings):
     assert "`" not in text and "a stretch of 15 m" in text and "at least 33 % of the closing speed" in text
 
 
+@pytest.mark.slow
 def test_pictures_show_the_place(played, settings, tmp_path):
     """Two worst of each kind beside each other; the failed car's red is where the failure was, in the middle of the lower picture."""
     records, recording = played

@@ -75,6 +75,7 @@ def braked():
     return friction_search.search(drive, {}, scene, SETTINGS, seed=0, control_hz=30.0, mu_of=mu_of), mu_of
 
 
+@pytest.mark.slow
 def test_the_least_slick_is_that_of_the_stopping_distance(braked):
     """On e metres of ice and then the dry road, v^2 = 2 a_ice e + 2 a_dry (gap - e)."""
     result, mu_of = braked

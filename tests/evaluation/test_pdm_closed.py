@@ -186,6 +186,7 @@ def user_at(view, x, y, vx=0.0, vy=0.0, *, kind=0, yaw=0.0):
     )
 
 
+@pytest.mark.slow
 def test_scores_of_a_free_street_grow_with_progress(score):
     run, _ = score
     found = run()

@@ -43,6 +43,7 @@ def look():
 # ---- trackers
 
 
+@pytest.mark.slow  # tests of planners that track follow their routes
 def test_the_bicycles_do_what_the_tracker_asks():
     speed, push, bend = (jnp.array(column) for column in ([3.0, 8.0, 15.0], [1.0, -3.0, 2.0], [0.1, -0.03, 0.01]))
     scene = scene_of([[0, 0], [0, 30], [0, 60]], [[50, 0]] * 3, speeds=speed)
@@ -116,6 +117,7 @@ def drive_expert(scene, *overrides, shift=(0.0, 0.0)):
     return jax.device_get(run())
 
 
+@pytest.mark.slow  # test_bicycle_waymax has its actions
 def test_waymaxs_expert_reproduces_its_log(logged):
     for feedback in ("false", "true"):
         place, action = drive_expert(logged, f"policy.feedback={feedback}")
@@ -125,6 +127,7 @@ def test_waymaxs_expert_reproduces_its_log(logged):
         assert np.abs(action).max() <= 1.0
 
 
+@pytest.mark.slow
 def test_feedback_brings_a_car_back_to_its_log(logged):
     place, _ = drive_expert(logged, shift=(0.5, 0.4))
     away = np.linalg.norm(place[:, 0] - logged.log.position[0, :80], axis=1)

@@ -94,6 +94,7 @@ def scores():
     return {name: values[0] for name, values in found.values.items()}, {name: mask[0] for name, mask in found.failures.items()}
 
 
+@pytest.mark.slow  # test_episode_metrics has collisions and faults
 def test_a_car_that_hits_one_that_stands_is_at_fault():
     found, _ = scores()
     assert found["overlap"].tolist() == [1, 1]

@@ -75,6 +75,7 @@ def driven(settings, scene):
 
 
 
+@pytest.mark.slow  # test_elevation tells levels apart
 def test_cars_keep_their_level_and_reach_their_goals(driven):
     motion, events, leader, metrics, active = jax.device_get(driven)
     place = motion.position + np.array([-50.0, -2.0, 0.0])  # the scene's origin is the first agent
@@ -87,6 +88,7 @@ def test_cars_keep_their_level_and_reach_their_goals(driven):
     assert not leader[..., 0].any() and metrics.speed[active].min() > SPEED_MPS - 0.1, "nothing is ahead of them"
 
 
+@pytest.mark.slow
 def test_pictures_have_the_heights_of_each_level(driven, scene):
     motion, *_, active = jax.device_get(driven)
     world = jax.tree.map(np.asarray, scene)

@@ -157,6 +157,7 @@ def town():
     return scenes, run(parameters), run(parameters)
 
 
+@pytest.mark.slow
 def test_one_seed_gives_the_same_records_bit_for_bit(town):
     _, first, second = town
     assert first.records.keys() == second.records.keys()
@@ -166,6 +167,7 @@ def test_one_seed_gives_the_same_records_bit_for_bit(town):
         np.testing.assert_array_equal(one.trajectory, other.trajectory)
 
 
+@pytest.mark.slow
 def test_every_episode_has_a_seed_and_actions_of_its_own(town):
     scenes, run, _ = town
     records = run.records
@@ -180,6 +182,7 @@ def test_every_episode_has_a_seed_and_actions_of_its_own(town):
         assert apart[0] == 0 and (apart[1:] > 0.1).all()
 
 
+@pytest.mark.slow
 def test_a_scene_has_its_scores_once(town):
     scenes, run, _ = town
     for name in ("wosac_2025", "wosac_2024", "wosac_2023", "wosac_min_ade_m", "wosac_evaluated"):
@@ -191,6 +194,7 @@ def test_a_scene_has_its_scores_once(town):
     assert (known["wosac_2025"] > 0).all() and (known["wosac_2025"] < known["wosac_of_log"]).all() and (known["wosac_of_log"] < 1).all()
 
 
+@pytest.mark.slow  # test_planner_evaluation has the command
 def test_the_command_writes_scores_and_files(tmp_path, undrawn_figures):
     """The log's own rollouts in a flat town are the log."""
     overrides = [*SMALL, "scenes.heldout.count=1", "policy=random", "observations=noise"]
@@ -213,6 +217,7 @@ def test_the_command_writes_scores_and_files(tmp_path, undrawn_figures):
 # ---- a logged scene
 
 
+@pytest.mark.slow  # test_wosac_golden has official scores
 @needs_golden
 def test_a_scene_of_files_has_the_official_scores_of_its_log():
     """From the file through check, packing and reading; rollouts as the official ones, where a step that is not known repeats the last."""

@@ -183,6 +183,7 @@ def test_numpy_network_is_the_policy(task, scene, reference, moments, parameters
                 np.testing.assert_allclose(worth, value[row, slot], atol=1e-5)
 
 
+@pytest.mark.slow
 def test_the_c_engine_drives_nearly_as_the_device_does(task, scene, reference, config):
     dynamics, state = environment.make_parts(config).dynamics, reference[0](jax.random.key(3), scene)
     steps = round(SECONDS * config["timing"]["control_hz"])

@@ -42,6 +42,7 @@ def stock(entry, drives):
     return engines.drive_stock(entry, drives, **STOCK)
 
 
+@pytest.mark.slow  # test_dynamics and test_contact_solver have the C engine
 def test_the_closed_form_is_the_stock_engine(run, stock):
     distance = equivalence.compute_distances(run, stock)
     found = equivalence.summarize(distance, bound_m=BOUND_M)
@@ -59,6 +60,7 @@ def test_mjx_and_finer_steps_are_the_closed_form(drives, run):
     assert mjx.max() < BOUND_M and mjx.max() < finer.max() < 0.5
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("changes", "median_m"), [({"friction_scale": 1.1}, 5e-3), ({"physics_hz": 60.0}, 5e-3)])
 def test_an_error_on_purpose_shows(entry, drives, run, stock, changes, median_m):
     wrong = equivalence.compute_distances(run, engines.drive_stock(entry, drives, **{**STOCK, **changes}))

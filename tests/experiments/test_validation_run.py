@@ -54,6 +54,7 @@ def stop(run):
     return found["front_locks_s"], found["rear_locks_s"]
 
 
+@pytest.mark.slow  # these seven share a program; a whole run is below
 def test_stops_use_the_friction_and_locked_wheels_are_found(drive):
     def locking(cases):
         trace = drive(cases)
@@ -84,6 +85,7 @@ def test_the_brakes_limit_solves_its_equation(car):
     assert motion_laws.total_mass(car) == pytest.approx(1980.03, abs=0.01)
 
 
+@pytest.mark.slow
 def test_braked_cars_stand(drive):
     held = motion_laws.standing(drive, **STANDING)
     assert held["brake_creep_mm"].max() < 0.1 and held["brake_rest"].max() < 1e-3
@@ -95,6 +97,7 @@ def test_braked_cars_stand(drive):
     assert motion_laws.standing(released, **STANDING)["brake_creep_mm"].max() > 1.0
 
 
+@pytest.mark.slow
 def test_cornering_ends_at_the_grip(drive, car):
     numbers = dict(frictions=[0.1, 0.9], speeds=[3.0, 12.0], from_s=1.0, to_s=2.0, wheelbase=car.wheelbase, **CLOCK)
     found = motion_laws.cornering(drive, steer=0.5, **numbers)
@@ -114,6 +117,7 @@ def test_a_kinematic_car_knows_no_grip(entry):
     assert np.ptp(motion_laws.stopping(free, speed=5.0, seconds=6.0, **STOP)["distance_m"]) < 1e-4
 
 
+@pytest.mark.slow
 def test_split_friction_turns_to_the_grip_and_is_mirrored(drive):
     found = motion_laws.split(drive, friction=0.8, speed=10.0, seconds=1.0, **CLOCK)
     yaw = found["yaw"]
@@ -121,6 +125,7 @@ def test_split_friction_turns_to_the_grip_and_is_mirrored(drive):
     np.testing.assert_allclose(yaw[0], -yaw[1], atol=0.01 * np.abs(yaw).max())
 
 
+@pytest.mark.slow
 def test_the_car_rides_on_its_springs(drive, car):
     found = motion_laws.ride(drive, car, friction=0.9, seconds=2.0, **CLOCK)
     assert found["on_springs"] == 1.0 and np.abs(found["travel_m"]).max() < 1e-3
@@ -144,6 +149,7 @@ def test_the_published_car_rides_on_its_stops():
     assert lying["load_sum"] == pytest.approx(1.0, abs=5e-3)
 
 
+@pytest.mark.slow
 def test_rolling_cars_gain_nothing_and_driven_ones_do(drive, entry, car):
     numbers = dict(frictions=[0.1, 0.9], steers=[0.0, 0.6], speed=10.0, seconds=2.0, **CLOCK)
     found = motion_laws.rolling(drive, entry, **numbers)
@@ -157,6 +163,7 @@ def test_rolling_cars_gain_nothing_and_driven_ones_do(drive, entry, car):
     assert motion_laws.rolling(pushed, entry, **numbers)["rise"].min() > 0.05
 
 
+@pytest.mark.slow
 def test_pieces_do_not_matter(drive, entry):
     """Five cases in pieces of four, of a second each, are the five cases, one by one."""
     cases = motion_laws.held([0.1, 0.3, 0.5, 0.7, 0.9], 5.0, (0.2, 0.1, 0.0), steps=40)
@@ -316,6 +323,7 @@ def square(cases):
     return engines.Run(*[cases.speed[:, None] ** 2] * 3)
 
 
+@pytest.mark.slow
 def test_cases_spread_over_processes_come_back_in_order():
     cases = motion_laws.held([0.1] * 5, np.arange(5.0), motion_laws.COAST, steps=1)
     with spread_cases(1) as here, spread_cases(2) as there:

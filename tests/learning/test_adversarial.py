@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from scipy import stats
 from support.adversarial import GAMMA, POLICY, make_discriminator, make_learner, make_numbers
+from support.choosing import slow_except
 from support.probes import STEERS, expert, ppo_config, probe, scenes
 from support.resuming import check_resumed_is_unbroken
 
@@ -68,7 +69,7 @@ def test_rewards_equal_their_definitions():
         np.testing.assert_allclose(judge.reward(score), np.log(probability) - np.log(1 - probability), rtol=1e-4)
 
 
-@pytest.mark.parametrize("name", ["gail", "airl"])
+@pytest.mark.parametrize("name", slow_except(["gail", "airl"], "gail"))
 def test_it_tells_two_distributions_apart(name):
     """States around 1 are the expert's, around -1 the policy's; D in between is the ratio of their densities, here sigmoid(2 x / 0.5^2)."""
     learner = make_learner_constants(name)
@@ -113,7 +114,7 @@ def course():
     return functools.lru_cache(make_learner)
 
 
-@pytest.mark.parametrize("name", ["gail", "airl"])
+@pytest.mark.parametrize("name", slow_except(["gail", "airl"], "gail"))
 def test_the_policy_does_as_the_expert_from_what_is_observed(course, name):
     """The environment pays for something else; no action of the expert is shown to the policy."""
     learner, stage = course(name), scenes(WORLDS, 1)
@@ -145,6 +146,7 @@ def test_only_pairs_of_the_expert_that_are_known_are_stored(course):
     assert 0.6 < follows.mean() < 0.72  # two of three steps
 
 
+@pytest.mark.slow
 def test_an_episode_that_does_not_fit_is_thinned():
     learner, stage = make_learner_constants("gail"), scenes(WORLDS, 1)
     worlds = trainer.start_worlds(probe(), jax.random.key(0), stage)

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from support.abstract_gpu import abstract_gpu
+from support.choosing import slow_except
 
 from scenefactory_jax.env.observations.vmax import Block
 from scenefactory_jax.learning.networks import attention, attention_kernel, encoder_modules, residual, residual_kernel
@@ -55,7 +56,10 @@ def differentiate(function, cotangent, *inputs):
     return wanted, pull(cotangent)
 
 
-@pytest.mark.parametrize(("keys", "dtype", "tolerance"), [(16, "float32", 1e-5), (70, "float32", 1e-5), (70, "bfloat16", 2e-2)])
+SIZES = [(16, "float32", 1e-5), (70, "float32", 1e-5), (70, "bfloat16", 2e-2)]
+
+
+@pytest.mark.parametrize(("keys", "dtype", "tolerance"), slow_except(SIZES, SIZES[1]))
 def test_attention_is_the_plain_one_with_its_gradient(keys, dtype, tolerance):
     of, mask = heads(0, keys, dtype)
     [cotangent] = (x.astype(dtype) for x in draw(1, of[0].shape))
@@ -68,7 +72,7 @@ def test_attention_is_the_plain_one_with_its_gradient(keys, dtype, tolerance):
     assert not any(np.asarray(x)[0].any() for x in gradient), "no gradient without a valid key"
 
 
-@pytest.mark.parametrize(("dtype", "tolerance"), [("float32", 1e-5), ("bfloat16", 3e-2)])
+@pytest.mark.parametrize(("dtype", "tolerance"), slow_except([("float32", 1e-5), ("bfloat16", 3e-2)], ("float32", 1e-5)))
 def test_residual_parts_are_the_plain_ones_with_their_gradient(dtype, tolerance):
     x, found, scale, weights = residuals(0)
     found = found.astype(dtype)
@@ -91,6 +95,7 @@ def test_residual_parts_begin_as_nothing_and_have_a_gradient_of_their_scale():
     assert gradient[2] != 0.0
 
 
+@pytest.mark.slow
 def test_kernels_work_under_vmap_over_parameters():
     x, found, scale, weights = residuals(0, batch=(2, 2))
     scales, many = jnp.stack([scale, -scale]), jax.tree.map(lambda leaf: jnp.stack([leaf, 2.0 * leaf]), weights)
@@ -118,7 +123,7 @@ def test_supported_residual_parts(sizes, made):
     assert not residual_kernel.fits(x[0, :8], found[0, :8], weights) and not residual_kernel.fits(x[:0], found[:0], weights)
 
 
-@pytest.mark.parametrize("dtype", ["float32", "bfloat16"])
+@pytest.mark.parametrize("dtype", slow_except(["float32", "bfloat16"], "float32"))
 def test_a_gpu_gets_kernels_and_other_devices_plain_jax(dtype):
     (queries, keys, values), mask = heads(0, 70, dtype)
     x, _, scale, weights = residuals(0, batch=(4,), width=32, found=32)

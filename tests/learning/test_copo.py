@@ -119,6 +119,7 @@ def train_on(learner, task, iterations):
     return state, jax.device_get(metrics), look
 
 
+@pytest.mark.slow  # of the learner that it shares with PPO
 def test_probes_1_to_3_values(learner):
     """Of an agent itself, of its neighbour, whose cue it does not see, and of both; the third slot, which pays poison, is empty."""
     np.testing.assert_allclose(train_on(learner, 1, 25)[2](0.0)[1], [[1.0, 1.0, 1.0]], atol=0.05)

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from support.abstract_gpu import abstract_gpu
+from support.choosing import slow_except
 
 from scenefactory_jax.learning.networks import embedding_kernel as kernel
 
@@ -22,7 +23,7 @@ def draw(seed, *shape):
     return jax.device_put(np.random.default_rng(seed).normal(size=shape).astype(np.float32))
 
 
-@pytest.mark.parametrize("networks", [1, 2])
+@pytest.mark.parametrize("networks", slow_except([1, 2], 2))
 def test_kernels_are_the_plain_layers_and_their_gradient(networks):
     weights = jax.tree.map(lambda *leaves: jnp.stack(leaves), *(layers(seed, 7, 64, 128, 32) for seed in range(networks)))
     x = draw(9, 5, 10, 7)

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from support import encoding
+from support.choosing import slow_except
 from support.encoding import ENTRIES, VMAX, draw, observe, observe_vmax
 
 from scenefactory_jax.cli import hydra_config as configs
@@ -29,13 +30,14 @@ SIZES = {
 }
 OBSERVATIONS = {"own": ({}, observe(0)), "vmax": (VMAX, observe_vmax(0))}
 CASES = [(name, kind) for name in ENTRIES for kind in OBSERVATIONS]
+LARGE = ("lq", "lqh", "mtr", "wayformer")  # of attention, which compiles long; `lq` stays among the fast tests
 
 
 def count(network, *inputs):
     return sum(leaf.size for leaf in jax.tree.leaves(jax.eval_shape(network.init, jax.random.key(0), *inputs)))
 
 
-@pytest.mark.parametrize("name", SIZES)
+@pytest.mark.parametrize("name", slow_except(SIZES, "none", "mlp", "lq"))
 def test_encoders_have_the_published_sizes(name):
     config = configs.load_config("train", "observations=vmax_road", "policy=actor_critic", f"policy/encoder={name}")
     entry, hidden, groups = config["policy"]["encoder"], config["policy"]["hidden"], config["observations"]
@@ -56,7 +58,7 @@ def built(name, kind):
     return module, draw(module, observation), jax.jit(module.apply)
 
 
-@pytest.mark.parametrize(("name", "kind"), CASES)
+@pytest.mark.parametrize(("name", "kind"), slow_except(CASES, *[case for case in CASES if case[0] not in LARGE or case == ("lq", "own")]))
 def test_any_leading_axes_give_the_same_numbers(name, kind):
     _, parameters, apply = built(name, kind)
     observation = OBSERVATIONS[kind][1]
@@ -91,7 +93,7 @@ def test_what_is_not_valid_changes_nothing(name, kind):
     np.testing.assert_allclose(apply(parameters, poisoned), apply(parameters, observation), atol=1e-5)
 
 
-@pytest.mark.parametrize("name", ENTRIES)
+@pytest.mark.parametrize("name", slow_except(ENTRIES, *[name for name in ENTRIES if name not in LARGE or name == "lq"]))
 def test_gradients_are_finite_and_reach_every_parameter(name):
     module, parameters, _ = built(name, "vmax")
     observation = OBSERVATIONS["vmax"][1]
@@ -174,6 +176,7 @@ def test_vectors_of_vmax_become_their_five_blocks(option, rows, steps):
     assert held == size + 4 + 1  # all numbers and flags, and the mask of the weather
 
 
+@pytest.mark.slow
 def test_late_fusion_reads_own_groups_as_they_are():
     observation = observe(1)
     joined = observation_blocks.join_steps(observation_blocks.make_reader({})(observation))
@@ -190,7 +193,7 @@ def test_late_fusion_reads_own_groups_as_they_are():
     }  # fmt: skip
 
 
-@pytest.mark.parametrize("name", ["mlp", "lq", "mtr"])
+@pytest.mark.parametrize("name", slow_except(["mlp", "lq", "mtr"], "mlp", "lq"))
 def test_bfloat16_is_near_float32_and_not_in_parameters(name):
     _, parameters, apply = built(name, "vmax")
     observation = OBSERVATIONS["vmax"][1]

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from support import encoding
 from support.abstract_gpu import abstract_gpu
+from support.choosing import slow_except
 from support.encoding import ENTRIES, observe
 from support.probes import AGENTS, ppo_config, probe, scenes
 
@@ -65,7 +66,7 @@ def test_each_critic_is_the_network_alone(critic):
         np.testing.assert_allclose(derive(twice, ACTION)[1][0], values[index], atol=1e-5)
 
 
-@pytest.mark.parametrize("name", ["none", "lq"])
+@pytest.mark.parametrize("name", slow_except(["none", "lq"], "none"))
 def test_networks_read_features_of_one_pass(name):
     """What actor and critics read of features that are computed together is what they read of the observation."""
     policy = actor_critic.make(encoder={"_target_": name, **ENTRIES[name]}, **POLICY, actor="tanh_gaussian", numbers=2)
@@ -123,7 +124,7 @@ def test_values_are_one_number_an_agent_and_kernels_are_lecuns():
     assert 0.98 * bound < np.abs(kernel).max() <= bound and np.abs(np.std(kernel) * np.sqrt(len(kernel)) - 1.0) < 0.05
 
 
-@pytest.mark.parametrize("shared", [False, True])
+@pytest.mark.parametrize("shared", slow_except([False, True], True))
 def test_an_encoder_is_shared_only_on_demand(shared):
     policy = actor_critic.make(encoder={"_target_": "mlp", **ENTRIES["mlp"]}, **{**POLICY, "shared_encoder": shared})
     drawn = jax.jit(policy.init)(jax.random.key(0), OBSERVATION)
@@ -167,7 +168,6 @@ def with_neighbours(env):
     return env._replace(observe=observe)
 
 
-SLOW = ("none", "late_fusion", "lqh", "mtr", "wayformer")  # gradients of each: test_encoders
 SHORT = {"lq": {"rounds": 1}, "wayformer": {"depth": 1}}
 
 
@@ -176,7 +176,8 @@ def made(worlds):
     return scenes(worlds)
 
 
-@pytest.mark.parametrize("name", [pytest.param(name, marks=pytest.mark.slow) if name in SLOW else name for name in ENTRIES])
+@pytest.mark.slow  # gradients of each: test_encoders; test_ppo trains
+@pytest.mark.parametrize("name", ENTRIES)
 def test_ppo_trains_each_encoder(name):
     shared = name not in ("none", "mlp")  # compiles sooner
     policy = actor_critic.make(encoder={"_target_": name, **ENTRIES[name], **SHORT.get(name, {})}, **{**POLICY, "shared_encoder": shared})

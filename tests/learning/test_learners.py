@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from scipy import stats
+from support.choosing import slow_except
 from support.probes import LEARNERS, SMALL, STEERS, make_learner, probe, scenes
 from support.resuming import check_resumed_is_unbroken
 
@@ -144,7 +145,7 @@ def train_on(course, name, task, iterations):
     return state, jax.device_get(metrics), lambda *cues: jax.device_get(ask(state, np.array(cues, np.float32)[:, None]))
 
 
-@pytest.mark.parametrize("name", ["sac", "td3"])
+@pytest.mark.parametrize("name", slow_except(["sac", "td3"], "sac"))
 def test_probes_1_to_3_values(course, name):
     np.testing.assert_allclose(train_on(course, name, 1, 30)[2](0.0, 0.0)[1], np.ones((2, 2)), atol=0.05)
     np.testing.assert_allclose(train_on(course, name, 2, 40)[2](-1.0, 1.0)[1], [[-1.0, 1.0]] * 2, atol=0.05)
@@ -156,7 +157,7 @@ def test_probe_4_action(course, name):
     np.testing.assert_allclose(train_on(course, name, 4, 40)[2](0.0, 0.0)[0][:, 0], [0.5, 0.5], atol=0.12)
 
 
-@pytest.mark.parametrize("name", list(LEARNERS))
+@pytest.mark.parametrize("name", slow_except(LEARNERS, "sac", "td3", "bc"))
 def test_probe_5_action_that_depends_on_the_observation(course, name):
     """Learners that imitate steer, too, as the expert does; what it does where that is not known they do not learn."""
     _, metrics, look = train_on(course, name, 5, 40)
@@ -251,6 +252,7 @@ def test_the_actor_of_td3_waits():
     assert stays(lambda x: x.learner.critics) == [False, False, False]
 
 
+@pytest.mark.slow
 def test_each_network_of_sac_moves_by_its_own_loss():
     """Features of all three are computed in one pass; the steps are those of the two losses alone."""
     policy, config = late_fusion.make(**SMALL, actor="tanh_gaussian", numbers=2), schema.read(LEARNERS["sac"], SACConfig, where="learner")
@@ -287,6 +289,7 @@ def test_each_network_of_sac_moves_by_its_own_loss():
         np.testing.assert_allclose(value, alone[name], rtol=1e-4, atol=1e-6, err_msg=name)
 
 
+@pytest.mark.slow  # test_ppo skips minibatches that are not finite
 def test_an_update_that_is_not_finite_changes_nothing():
     policy = late_fusion.make(**SMALL, actor="tanh_gaussian", numbers=2)
     cue = {"cue": jnp.ones((1, 4, 1))}

@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from support.choosing import slow_except
 from support.hand_scenes import column_of, scene_of
 from support.policy_traffic import (
     ABSENT,
@@ -86,6 +87,7 @@ def agents(folder):
     return drive
 
 
+@pytest.mark.slow
 def test_a_planner_drives_in_place_of_the_policy(folder):
     planner = make_planner("constant")
     _, boxes = simulate(make(folder, policy=planner["policy"], observations=planner["observations"]), street())
@@ -120,6 +122,7 @@ def test_the_policy_sees_agents_as_its_own_see_cars(agents, tiny, alone):
     assert np.abs(seen[-1] - alone[1].position[-1]).max() > 1e-2, "it drives otherwise beside the agent"
 
 
+@pytest.mark.slow  # test_traffic has agents that see and hit vehicles
 def test_agents_see_and_hit_the_vehicles(folder):
     config = smoke("unused", "traffic=policy", f"traffic.run={folder}", "spawning=logged", "step_metrics.collision_grace_steps=0", *PLAIN)
     env = sf.make(config | {"observations": {"neighbours": config["observations"]["neighbours"]}})
@@ -136,6 +139,7 @@ def test_agents_see_and_hit_the_vehicles(folder):
     assert hit.tolist() == [True, False]
 
 
+@pytest.mark.slow
 def test_actions_are_held_and_worlds_of_one_batch_may_be_at_other_steps(tiny, alone):
     """In a batch the policy acts whenever an action is due in any world; each world takes its own only."""
     kind = tiny
@@ -160,6 +164,7 @@ def test_actions_are_held_and_worlds_of_one_batch_may_be_at_other_steps(tiny, al
         assert changed[due].all() and not changed[~due].any()
 
 
+@pytest.mark.slow
 def test_the_same_seed_gives_the_same_bits_and_samples_differ_between_seeds(folder, tiny, alone):
     again, other = simulate(tiny, street()), simulate(tiny, street(), key=1)
     for first, second in zip(jax.tree.leaves(alone[1]), jax.tree.leaves(again[1]), strict=True):
@@ -194,6 +199,7 @@ def constant(monkeypatch, folder, throttle):
     monkeypatch.setattr(policy_io, "load_policy", lambda run: trained._replace(policy=policy, parameters={}))
 
 
+@pytest.mark.slow
 def test_who_stands_walks_or_has_no_slot_follows_the_log(folder, monkeypatch):
     constant(monkeypatch, folder, 0.0)  # it coasts
     others = track([9.0, 5.0], steps=61), track([20.0, -5.0], (0.0, 1.0), kind="pedestrian", size=(0.7, 0.7), steps=61)
@@ -210,7 +216,7 @@ def test_who_stands_walks_or_has_no_slot_follows_the_log(folder, monkeypatch):
     assert start(jnp.int32(0)).present.tolist() == [False, False, False, False, True]
 
 
-@pytest.mark.parametrize("at_end", ["leave", "park", "restart"])
+@pytest.mark.parametrize("at_end", slow_except(["leave", "park", "restart"], "leave"))
 def test_a_vehicle_that_arrives_does_as_the_config_says(folder, monkeypatch, at_end):
     constant(monkeypatch, folder, 0.05)  # about as much as it rolls off
     state, boxes = simulate(make(folder, at_end=at_end), street(cars=[[0.0, 0.0]], speeds=[10.0], steps=11), steps=60)
@@ -228,6 +234,7 @@ def test_a_vehicle_that_arrives_does_as_the_config_says(folder, monkeypatch, at_
         np.testing.assert_allclose(velocity[end + 1], [10.0, 0.0], atol=1e-4)
 
 
+@pytest.mark.slow
 def test_vehicles_enter_at_their_time_where_there_is_room(folder, monkeypatch):
     constant(monkeypatch, folder, 0.05)
     late = street(cars=[[-20.0, 0.0], [30.0, 0.0]], speeds=[10.0, 5.0])
@@ -254,6 +261,7 @@ def test_worlds_without_traffic_are_sound(tiny):
     assert jax.eval_shape(kind.read, scene, (), jnp.int32(0)).present.shape == make_empty_boxes().present.shape
 
 
+@pytest.mark.slow
 def test_it_is_a_part_of_mixed_if_it_has_a_weight(folder, alone):
     entry = load_config("task", "traffic=mixed")["traffic"]
     assert entry["parts"]["policy"]["weight"] is None

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from scipy import stats
+from support.choosing import slow_except
 from support.probes import NUMBERS, PRESENT, SMALL, make_trainer, ppo_config, probe, scenes
 
 from scenefactory_jax.cli import hydra_config as configs
@@ -284,7 +285,7 @@ def test_metrics_count_what_happened(course):
     assert metrics["events/goal_reached"] == 0.0 and metrics["speed"] == 2.0 and metrics["ppo/skipped"] == 0.0
 
 
-@pytest.mark.parametrize("life, length", [(5, 100), (100, 6)])
+@pytest.mark.parametrize("life, length", slow_except([(5, 100), (100, 6)], (100, 6)))
 def test_a_repeated_action_is_one_sample(life, length):
     """Lives of 5 control steps end within the second action; worlds of 6 run out of time with it. What slots pay afterwards is nobody's."""
     env, policy, stage = probe(life=life, episode_steps=length)._replace(action_repeat=3), late_fusion.make(**SMALL), scenes(2, 1)
@@ -395,7 +396,7 @@ def test_probe_5_action_that_depends_on_the_observation(probes):
     assert float(history[-1]["ppo/left_out"]) == 0.0
 
 
-@pytest.mark.parametrize("kept, groups", [(5, 1), (3, 2), (1, 2)])
+@pytest.mark.parametrize("kept, groups", slow_except([(5, 1), (3, 2), (1, 2)], (3, 2)))
 def test_a_rollout_keeps_active_agents_first(course, kept, groups):
     """Rows with weight are rows of the whole rollout, all or as many as there is room for; what finds no room is counted."""
     policy, env, stage = late_fusion.make(**SMALL), probe(life=5, episode_steps=4), scenes(WORLDS)
@@ -445,6 +446,7 @@ def test_rewards_are_scaled_for_the_learner(course):
         np.testing.assert_allclose(getattr(other, name), 0.25 * getattr(one, name), rtol=1e-6)
 
 
+@pytest.mark.slow
 def test_a_rollout_in_float16_holds_what_the_policy_saw(course):
     """Half the memory; a minibatch has it as float32 again."""
     policy, env, stage = late_fusion.make(**SMALL), probe(life=5, episode_steps=4), scenes(WORLDS)

@@ -34,6 +34,7 @@ def drive_town(out, *, scenes, untrained, dynamics):
     return sf.evaluate(sf.load_config("evaluate", "run=town", f"out={out}", overrides, *plainly)).records
 
 
+@pytest.mark.slow  # others play bundled policies; how well `town` drives changes with the simulator only
 def test_town_drives_on_other_scenes(tmp_path, quickly):
     records = drive_town(tmp_path, scenes=1, untrained="false", dynamics="articulated")["strict"]
     bends = records["route_m"] >= agent_metrics.BEND * records["start_distance_m"]

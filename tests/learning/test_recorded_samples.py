@@ -98,6 +98,7 @@ def test_samples_that_fit_are_all_in_the_buffer_and_are_learnt(bank, learners):
     np.testing.assert_allclose(action[:, :2], [[-0.5, STEERS], [0.5, STEERS]], atol=0.1)
 
 
+@pytest.mark.slow
 def test_samples_that_do_not_fit_pass_through_the_buffer(bank, learners):
     """60 of 100 samples are there at a time; every chunk comes once an epoch, in another order each."""
     (folder, samples), (_, learner) = bank, learners(60)

@@ -29,7 +29,9 @@ def sets(seed, *, batch, rows, features):
 @pytest.mark.parametrize(
     ("activation", "rows", "features", "widths"),
     [
-        ("elu", 150, 5, (96, 96)), ("elu", 70, 15, (64, 32)), ("relu", 24, 7, (32, 64)), ("tanh", 24, 7, (32, 64)),
+        ("elu", 150, 5, (96, 96)),
+        *[pytest.param("elu", 70, 15, (64, 32), marks=pytest.mark.slow), pytest.param("relu", 24, 7, (32, 64), marks=pytest.mark.slow)],
+        pytest.param("tanh", 24, 7, (32, 64), marks=pytest.mark.slow),
         *[pytest.param("elu", 24, 7, (32, 64), marks=pytest.mark.slow), pytest.param("relu", 150, 5, (96, 96), marks=pytest.mark.slow)],
     ],
 )  # fmt: skip

@@ -57,6 +57,7 @@ def pasts(runs):
 # ---- members
 
 
+@pytest.mark.slow
 def test_a_pool_of_one_policy_is_that_policy_bit_for_bit(runs):
     one, other = (simulate(kind, street())[1] for kind in (make(runs[0]), make_pool(runs[0])))
     jax.tree.map(np.testing.assert_array_equal, one, other)
@@ -80,6 +81,7 @@ def test_members_are_drawn_by_weight(runs):
 # ---- past policies
 
 
+@pytest.mark.slow  # test_sharding compiles once with past policies
 def test_past_policies_are_arguments_of_the_program(runs, pasts):
     """Each world drives by the parameters of its own policy, only of slots that have one; other parameters compile nothing."""
     alone = simulate(make(runs[0]), street())[1].position[-1]
@@ -96,6 +98,7 @@ def test_past_policies_are_arguments_of_the_program(runs, pasts):
     assert pasts._cache_size() == 1
 
 
+@pytest.mark.slow
 def test_an_environment_without_past_policies_reads_the_traffic_with_them(runs):
     """The experts of learners have environments of their own, with other observations, in which past policies are not bound."""
     trained, scene, step = policy_io.load_policy(runs[0]), street(), jnp.int32(0)

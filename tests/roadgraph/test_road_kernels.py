@@ -110,6 +110,7 @@ def test_the_gathering_kernel_finds_what_plain_jax_finds(scenes, cars, count):
     assert mask.all(axis=-1).any() == (count == 20) and mask.any() and not mask[~np.asarray(active)].any()
 
 
+@pytest.mark.slow
 def test_derivatives_are_those_of_plain_jax(scenes, cars):
     """Of both modes, through the choice between kernel and plain JAX."""
     scene = jax.device_put(jax.tree.map(lambda leaf: np.asarray(leaf)[0], scenes))

@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from support.choosing import slow_except
 from support.running import SHARED
 
 from scenefactory_jax.cli.hydra_config import load_config
@@ -62,7 +63,10 @@ def look(count):
     return jax.jit(at)
 
 
-@pytest.mark.parametrize(("source", "size_m", "count"), [("scenes", 5.0, 350), ("scenes", 3.0, 20), ("womd_scenes", 25.0, 64)])
+GRIDS = [("scenes", 5.0, 350), ("scenes", 3.0, 20), ("womd_scenes", 25.0, 64)]
+
+
+@pytest.mark.parametrize(("source", "size_m", "count"), slow_except(GRIDS, *GRIDS[:2]))
 def test_a_grid_finds_what_a_search_through_all_segments_finds(request, source, size_m, count):
     scenes = request.getfixturevalue(source)
     with_grid, find = spatial_grid.attach_grid(scenes, radius_m=10.0, size_m=size_m), look(count)

@@ -262,6 +262,7 @@ def test_recordings_are_equal_after_save_and_load(tmp_path, teacher, left_turn):
         load(tmp_path / "r.npz", digest=other)
 
 
+@pytest.mark.slow
 def test_reads_lists_the_parameters_that_change_the_reference_car(car, teacher):
     """The digest of the recordings is made from `READS`: each of these numbers changes the reference car, no other does."""
 

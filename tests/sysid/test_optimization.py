@@ -173,6 +173,7 @@ def test_pairs_are_traced_in_chunks(lesson):
     assert path.pace[2, 11] > path.pace[0, 11] + 0.01, "the third pair is the one with the stronger engine"
 
 
+@pytest.mark.slow
 def test_a_car_on_its_own_recording_makes_no_error_and_another_does(lesson, config):
     simulator, begin, own = lesson
     weights = config["sysid"]["weights"]
@@ -184,6 +185,7 @@ def test_a_car_on_its_own_recording_makes_no_error_and_another_does(lesson, conf
     assert only[0] < 1e-6 and only[1] > 5e-4, "pairs go to the candidates and manoeuvres that they are of"
 
 
+@pytest.mark.slow
 def test_residuals_square_to_the_loss(lesson, config):
     simulator, begin, own = lesson
     weights, plan = config["sysid"]["weights"], candidate_simulation.stack_recordings(own)

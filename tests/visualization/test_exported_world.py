@@ -87,6 +87,7 @@ def test_the_script_is_short_and_needs_mujoco_and_numpy_alone():
     assert {name for name in names if name not in sys.stdlib_module_names} == {"mujoco", "numpy"}
 
 
+@pytest.mark.slow
 def test_braking_distance_follows_the_sampled_friction(tmp_path):
     speed, distance = 8.0, {}
     for name, weather in {"ice": ICE, "dry": DRY}.items():
@@ -117,6 +118,7 @@ def test_plain_mujoco_with_the_callback_is_the_script(tmp_path):
     np.testing.assert_array_equal(data.qpos, expected)
 
 
+@pytest.mark.slow  # test_docs drives an exported world
 def test_the_exported_car_drives_like_the_package(tmp_path):
     config = load_config("validate")
     validation = config["validation"]
@@ -247,6 +249,7 @@ def test_a_world_holds_the_start_of_the_episode(tmp_path):
     assert model.numeric("tyre_shape").data.tolist() == [CAR.tyre_shape] * 2
 
 
+@pytest.mark.slow
 def test_cars_that_differ_keep_their_parameters_and_boxes(tmp_path):
     scene = scene_with((0, 0, 0, 5), (30, 0, 0, 5))
     scene = replace(scene, agents=replace(scene.agents, size=jnp.array([[4.0, 2.0], [9.0, 2.5]], jnp.float32)))
@@ -265,6 +268,7 @@ def test_without_cars_the_error_says_so():
         exported_world.sample_start(settings(), replace(scene, agents=replace(scene.agents, present=jnp.zeros(1, bool))), seed=0)
 
 
+@pytest.mark.slow
 def test_patches_change_the_friction_under_each_wheel(tmp_path):
     config, scene = settings("weather=split"), scene_with((0, 0, 0, 8))
     start = exported_world.sample_start(config, scene, seed=0)

@@ -90,6 +90,7 @@ def test_cars_have_the_given_posture():
     assert not opacity[1].any() and (opacity[0] == built.colours[built.geoms[0], 3]).all()
 
 
+@pytest.mark.slow  # these share a recording; test_train replays a run, test_report writes films
 def test_recorded_joints_are_shown_as_they_are(recording):
     joints = np.random.default_rng(1).normal(size=(*recording.shots.yaw.shape, scene_model.JOINTS))
     world = actors.make_actors(changed(recording, joints=joints), 0, CAR)
@@ -100,6 +101,7 @@ def test_recorded_joints_are_shown_as_they_are(recording):
     assert world.opacity[last, 0] == 1.0 and world.opacity[-1, 0] == 0.0 and (np.diff(world.opacity[last:, 0]) <= 0).all()
 
 
+@pytest.mark.slow
 def test_wheels_without_joints_turn_as_fast_as_the_road_passes(recording):
     world = actors.make_actors(recording, 0, CAR)
     spin = world.joints[:, 2, scene_model.SPIN[0]]
@@ -115,6 +117,7 @@ def hue(colour):
     return (colour - colour.min()) / max(np.ptp(colour), 1.0)
 
 
+@pytest.mark.slow
 def test_from_above_every_car_is_at_its_position(opened, recording):
     world, look = actors.make_actors(recording, 0, CAR), settings(view="bird", width=960, height=540)
     [picture] = film.frames(world, [20], settings=look, slot=0, **LOOK)
@@ -128,6 +131,7 @@ def test_from_above_every_car_is_at_its_position(opened, recording):
         assert np.abs(hue(pixel) - hue(drawing.colour_of(slot))).max() < 0.25, slot
 
 
+@pytest.mark.slow
 def test_from_behind_the_followed_car_fills_the_middle(opened, recording):
     world = actors.make_actors(recording, 0, CAR)
     for slot in (0, 2):
@@ -137,6 +141,7 @@ def test_from_behind_the_followed_car_fills_the_middle(opened, recording):
         assert np.mean(same) > 0.2, slot
 
 
+@pytest.mark.slow
 def test_a_film_ends_a_second_after_the_followed_car(opened, recording, tmp_path):
     look = settings(width=64, height=64, stride=30, view="both")
     for slot in (0, 2):
@@ -147,6 +152,7 @@ def test_a_film_ends_a_second_after_the_followed_car(opened, recording, tmp_path
             assert image.n_frames == len(range(0, end, 30)) and image.size == (128, 64)
 
 
+@pytest.mark.slow
 def test_mp4_is_written_with_its_extra(opened, recording, tmp_path):
     pytest.importorskip("imageio_ffmpeg", reason="the extra `video` is not installed")
     out = film.write(tmp_path / "film.mp4", recording, settings=settings(width=128, height=72, stride=20), **LOOK)
@@ -156,6 +162,7 @@ def test_mp4_is_written_with_its_extra(opened, recording, tmp_path):
 # ---- what cannot be
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "fps", "slot", "message"),
     [
@@ -202,6 +209,7 @@ def test_a_wrong_setting_is_named(override, message):
     assert message in str(caught.value)
 
 
+@pytest.mark.slow
 def test_replay_writes_a_picture(opened, tmp_path):
     path = written(tmp_path, document())
     small = ["film.width=128", "film.height=72", "film.at_s=0.2"]

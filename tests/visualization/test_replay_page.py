@@ -201,6 +201,7 @@ def test_what_cannot_be_shown_is_named(recording):
 # ---- the command
 
 
+@pytest.mark.slow
 def test_a_scene_file_is_replayed_with_its_signs(tmp_path):
     signed = scene_document()
     signed["roads"].append({"geometry": [{"x": 5.0, "y": 4.0, "z": 0.0}], "type": "stop_sign", "map_element_id": 17, "id": 90})

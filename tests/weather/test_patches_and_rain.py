@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import shapely
 import yaml
+from support.choosing import slow_except
 from support.hand_scenes import column_of, road_of, scene_of
 from support.running import ROOT
 
@@ -29,6 +30,7 @@ pytestmark = pytest.mark.usefixtures("quickly")
 
 ICE, SNOW = SURFACES.index("ICE"), SURFACES.index("SNOW")
 OPTIONS = sorted(path.stem for path in (ROOT / "conf" / "weather").glob("*.yaml") if path.stem != "base")
+MANY = ("all", "puddles", "split", "storm")  # layouts, each a program
 DRY = make_uniform(jnp.float32(0.0), jnp.int32(0))
 KEY = jax.random.key(0)
 inside, read_condition = jax.jit(patches.contains_points), jax.jit(patches.read_condition)
@@ -99,6 +101,7 @@ def test_inside_turns_with_the_plane():
     assert (found != turned).mean() < 2e-3  # points on a border
 
 
+@pytest.mark.slow
 def test_repeated_vertices_and_absent_patches_change_nothing():
     rng = np.random.default_rng(2)
     shapes = [patch(blob(rng, n), radius=r, closed=c) for n, r, c in ((6, 0.0, True), (3, 1.0, False), (1, 2.0, False))]
@@ -267,6 +270,7 @@ def test_places_are_as_likely_in_every_metre_of_lane():
     assert np.histogram(x[y < 10], bins=6, range=(-60, 60))[0].std() < 40
 
 
+@pytest.mark.slow
 def test_chance_and_the_open_roads_surface():
     numbers = LAYOUTS["circles"] | {"count": 2000, "chance": 0.3, "surface": None}
     laid = jax.jit(lambda key: patch_layouts.circles(key, lanes_scene(), make_uniform(jnp.float32(0.0), jnp.int32(2)), **numbers))(KEY)
@@ -307,7 +311,7 @@ def config_of(*overrides):
 SCENE = lanes_scene()
 
 
-@pytest.mark.parametrize("option", OPTIONS)
+@pytest.mark.parametrize("option", slow_except(OPTIONS, *[name for name in OPTIONS if name not in MANY]))
 def test_every_option_samples_the_weather_of_an_episode(option):
     sample = jax.jit(jax.vmap(road_condition.make(config_of(f"weather={option}")["weather"]), (0, None)))
     first = jax.device_get(sample(jax.random.split(KEY, 6), SCENE))
