@@ -667,7 +667,7 @@ def test_a_protocol_decides_all_of_an_episode_but_what_the_policy_sees_and_does(
     if name == "trained":
         assert judged == runs
         return
-    own = ("observations", "actions", "termination")  # what the policy learnt to see and to do; how agents end is `protocol.termination`
+    own = ("observations", "actions", "reward", "termination")  # what the policy learnt to see, to do and to want; `protocol.termination`
     for group in set(environment.GROUPS) - set(own):
         assert judged[0][group] == judged[1][group], group
     assert judged[0]["scenes"]["pack"] == judged[1]["scenes"]["pack"]
