@@ -76,6 +76,7 @@ def test_columns_without_a_bound_are_clipped_and_the_others_are_what_they_were()
     np.testing.assert_array_equal(high, [1, limit, limit, *[limit] * 4, 1, 1])
 
 
+@pytest.mark.slow
 def test_episodes_are_drawn_from_all_scenes_and_from_their_key_alone():
     pool = episodes.make_pool(None, ALONE, scenes(), alone=True)
     begin = jax.jit(jax.vmap(lambda key: episodes.begin_episode(pool.env, pool.scenes, key)))

@@ -167,6 +167,7 @@ def test_without_autoreset_worlds_begin_anew_where_a_mask_says():
     assert not (envs.step(action)[2] & ended).any()
 
 
+@pytest.mark.slow
 def test_gymnasium_makes_both_and_its_wrappers_work():
     made = gymnasium.make_vec(ID, num_envs=WORLDS, overrides=ALONE, scenes=scenes(), render_mode="rgb_array")
     assert isinstance(made.unwrapped, DriveVector) and made.metadata["autoreset_mode"] is AutoresetMode.NEXT_STEP

@@ -25,7 +25,7 @@ from scenefactory_jax.visualization.report import planner_table
 
 SMALL = ["scenes=streets", "scenes.heldout.count=3", "dynamics=bicycle_waymax", "timing=waymax", "actions=acceleration"]
 SMALL += ["timing.episode_s=2", "scenes.pack.traffic=8", "step_metrics.kernels=false"]
-PLANNERS = ["log", "random"]
+PLANNERS = ["random"]
 
 
 def asked(out, *words, protocol="vmax"):
@@ -41,15 +41,24 @@ def plain(tmp_path_factory):
 
 
 def test_planners_need_no_run(plain):
-    assert list(plain.records) == ["whole, log", "whole, random"]
+    assert list(plain.records) == ["whole, random"]
     text = plain.report.read_text()
     assert "evaluate protocol=vmax" in text and "run=" not in text.split("evaluate protocol=vmax")[1].split("```")[0]
-    assert "| Difference to | random |" in text and "The planner log less each other policy" in text
     assert "**whole**: nothing but time ends an agent" in text
     with pytest.raises(ConfigError, match=r"run: missing; give run=\.\.\., or planners="):
         evaluate(asked("nowhere"))
     with pytest.raises(ConfigError, match=r"untrained: expected false without a run"):
         evaluate(asked("nowhere", "planners=[random]", "untrained=true"))
+
+
+@pytest.mark.slow  # a program a planner
+def test_the_first_planner_is_compared_with_the_others(plain, tmp_path):
+    with quick_compilation():
+        both = evaluate(asked(tmp_path, "planners=[log,random]"))
+    assert list(both.records) == ["whole, log", "whole, random"]
+    assert_same_bits(both.records["whole, random"], plain.records["whole, random"])
+    text = both.report.read_text()
+    assert "| Difference to | random |" in text and "The planner log less each other policy" in text
 
 
 def test_the_table_has_every_metric_with_its_episodes(plain):
@@ -109,7 +118,7 @@ def test_the_page_marks_where_metrics_fail(plain):
 
 @pytest.mark.slow  # test_noisy_start has the starts, test_compare the comparison
 def test_falls_of_a_noisy_start(plain, tmp_path, capsys):
-    """Of the second planner, paired with the evaluation without noise; the files of the first are left out."""
+    """Paired with the evaluation without noise."""
     with quick_compilation():
         noisy = evaluate(asked(tmp_path / "noisy", "planners=[random]", protocol="vmax_noise"))
     assert "Second before the start" in noisy.report.read_text()

@@ -454,7 +454,6 @@ def steps_of(config):
 
 TIMED = {"vmax": "vmax", "plants": "vmax", "scenarionet": "scenarionet", "curriculum": "scenarionet"}  # study -> its protocol
 TIMED |= {"learners": "route100", "drive_rewards": "route100", "drive_collisions": "route100", "vmax_scenes": "vmax"}
-MANY = tuple(name for name in TIMED if name != "learners")  # environments
 STREAMED = "recipe_drive"  # trains on a mixture of banks and generated scenes
 WHOLE = [name for name in STUDIES if name not in (*TIMED, STREAMED)]
 TWINS = {"rewards_laptop", "network_laptop"}  # nearly the same variants as another study, for a CPU
@@ -466,7 +465,8 @@ def test_names_of_a_study_fit_each_other(name):
     study_plan.check(hydra_config.load_config("study", f"study={name}"))
 
 
-@pytest.mark.parametrize("name", [pytest.param(n, marks=[pytest.mark.slow] if n in MANY else []) for n in sorted(TIMED)])
+@pytest.mark.slow  # test_train_learners and test_train build each learner and protocol
+@pytest.mark.parametrize("name", sorted(TIMED))
 def test_every_row_of_a_study_of_equal_time_builds(name, tmp_path):
     """Every learner finds its keys and its network, all judge by the study's protocol, and each row has its time."""
     entry = hydra_config.load_config("study", f"study={name}", f"runs={tmp_path}", "train_scenes=train.bank", "test_scenes=test.bank")

@@ -30,6 +30,7 @@ def run(tmp_path_factory):
     return train(smoke(out, "learner=sac", *own, *SMALL))
 
 
+@pytest.mark.slow  # these share a run; test_learners trains each learner, test_train runs the command
 def test_one_word_trains_sac(run):
     first, last = run.metrics
     assert 0 < first["steps/updates"] < last["steps/updates"] == 64
@@ -39,6 +40,7 @@ def test_one_word_trains_sac(run):
     assert last["casps"] == pytest.approx(last["steps/spawned"] / last["seconds"])
 
 
+@pytest.mark.slow
 def test_its_policy_is_the_actor(run):
     trained, observation = sf.load_policy(run.folder), run.state.worlds.observation
     mean, log_std, value = jax.jit(trained.policy.apply)(trained.parameters, observation)
@@ -47,6 +49,7 @@ def test_its_policy_is_the_actor(run):
     assert np.abs(mean).max() <= 1.0 and not mean[..., 2].any()  # the third number is not read
 
 
+@pytest.mark.slow
 def test_its_policy_drives_background_traffic(run):
     """They are sampled under their tanh."""
     entry = load_config("task", "traffic=policy")["traffic"] | {"run": str(run.folder), "sample": True}
@@ -57,7 +60,7 @@ def test_its_policy_drives_background_traffic(run):
     assert jax.tree.structure(after) == jax.tree.structure(state) and after.drives.shape == (1,)
 
 
-@pytest.mark.slow  # test_planners has the expert
+@pytest.mark.slow  # test_bicycle_waymax has the expert's actions
 def test_the_expert_of_a_run_follows_the_log(tmp_path):
     """Articulated cars or others, thirty times a second or ten: the expert is told by the run's config."""
     config = smoke(tmp_path / "run", "learner=bc", "spawning=logged", "actions=one_pedal_10hz", *SMALL)

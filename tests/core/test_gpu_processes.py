@@ -72,10 +72,8 @@ def test_an_error_is_raised_after_all_processes_have_ended(tmp_path, capfd):
     assert (tmp_path / "done").exists() and "this one fails" in capfd.readouterr().err
 
 
-LACKING = pytest.param(SceneError("no.bank: no such folder"), marks=pytest.mark.slow)
-
-
-@pytest.mark.parametrize("error", [ConfigError("worlds: expected an integer >= 1, got 0"), LACKING])
+@pytest.mark.slow
+@pytest.mark.parametrize("error", [ConfigError("worlds: expected an integer >= 1, got 0"), SceneError("no.bank: no such folder")])
 def test_a_mistake_of_the_user_is_raised_and_not_printed(error, capfd):
     with pytest.raises(ConfigError, match=str(error)):
         gpu_processes.run_on_gpus(mistaken, 2, error)

@@ -416,7 +416,8 @@ def test_a_folder_that_cannot_be_listed_is_named_and_read_later(tmp_path, monkey
     assert conversion.convert(folder, out, **options()).scenes == 2 and bank_reader.open(out).names == ("a", "b")
 
 
-@pytest.mark.parametrize("workers", [1, pytest.param(2, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("workers", [1, 2])
 def test_what_happens_to_a_reader_costs_its_file_alone(tmp_path, workers):
     folder = streets(tmp_path / "in", "a", "b_killed", "c_two", "d_endless", "e_map", "f_broken", "g")
     spread = functools.partial(spreads.local, workers=workers, timeout_s=2.0)

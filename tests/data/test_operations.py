@@ -459,7 +459,7 @@ def test_what_cannot_be_done_is_named(town, overrides, message):
         command(town, *overrides)
 
 
-@pytest.mark.slow  # test_digests simulates
+@pytest.mark.slow
 def test_scenes_are_simulated(capsys):
     small = ["scenes.count=3", "scenes.pack.agents=4", "simulate.worlds=2", "simulate.seconds=0.2", "op=simulate"]
     found = scenes(hydra_config.load_config("scenes", *small))

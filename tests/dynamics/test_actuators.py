@@ -49,6 +49,7 @@ def test_reverse_gear_engages_at_low_speed_only():
     np.testing.assert_array_equal(torque(-11.0, -30.0), 0.0)
 
 
+@pytest.mark.slow  # test_dynamics drives and stops; torques are above
 def test_car_accelerates_drives_backwards_and_does_not_reverse_from_speed():
     """0 to 100 km/h in 10 to 11 s; backwards up to 9 to 10.5 m/s; from 20 m/s a throttle below zero is no brake."""
     carry = place(3, speed=jnp.array([0.0, 0.0, 20.0]))
@@ -75,11 +76,12 @@ def stop(*, abs_enabled, steps=2400):
     return carry, locked
 
 
-@pytest.fixture(scope="module", params=[True, pytest.param(False, marks=pytest.mark.slow)], ids=["abs", "no abs"])
+@pytest.fixture(scope="module", params=[True, False], ids=["abs", "no abs"])
 def stopped(request):
     return request.param, *stop(abs_enabled=request.param)
 
 
+@pytest.mark.slow
 def test_stops_use_the_friction_of_the_road(stopped):
     """100 to 0 km/h at friction 1.1, 0.5, 0.2: at most 1.05 v^2 / (2 mu g), with the anti-lock controller and without."""
     _, carry, _ = stopped
@@ -88,6 +90,7 @@ def test_stops_use_the_friction_of_the_road(stopped):
     assert carry.qpos[0, 0] < 40.0 and np.abs(carry.qvel[:, :6]).max() < 1e-3 and np.abs(carry.qpos[:, 1]).max() < 0.05
 
 
+@pytest.mark.slow
 def test_wheels_lock_without_the_controller_only_and_in_front_first(stopped):
     abs_enabled, _, locked = stopped
     if abs_enabled:

@@ -79,6 +79,7 @@ def solve(cases, *, iterations):
     return jax.vmap(one)(*cases)
 
 
+@pytest.mark.slow  # test_dynamics has the C engine
 def test_converges_to_the_c_engine(cases, truth):
     acceleration, force = solve(cases, iterations=4)
     apart, scale = np.abs(np.asarray(acceleration) - truth[0]), np.abs(truth[0]).max(0)

@@ -87,6 +87,7 @@ def hold(brake=0.0, seconds=3):
     return np.tile(np.array([0.0, 0.0, brake]), (seconds * CHUNK, 1, 1))
 
 
+@pytest.mark.slow  # these four share a program; test_elevation has the roads
 def test_a_coasting_car_has_the_acceleration_of_the_grade(drive):
     _, motion = drive(worlds(list(map(plane, SLOPES)), speed=10.0), hold())
     straight = SLOPES[:, 1] == 0
@@ -100,6 +101,7 @@ def test_a_coasting_car_has_the_acceleration_of_the_grade(drive):
     np.testing.assert_allclose(motion.upright, upright, atol=2e-3)
 
 
+@pytest.mark.slow
 def test_stopping_on_a_grade_takes_the_distance_of_gravity_and_friction(drive):
     """Full brakes, limited by friction: the force is that of the load g cos, and gravity adds g sin."""
     straight = SLOPES[:, 1] == 0
@@ -112,6 +114,7 @@ def test_stopping_on_a_grade_takes_the_distance_of_gravity_and_friction(drive):
     assert np.abs(last - last[0]).max() < 1e-3, "brakes hold the car on the grade"
 
 
+@pytest.mark.slow
 def test_at_the_neutral_speed_of_a_banked_curve_the_tyres_carry_nothing_across(drive):
     neutral = np.sqrt(G * RADIUS * BANK)
     speed = neutral * np.linspace(0.86, 1.14, 8)
@@ -125,6 +128,7 @@ def test_at_the_neutral_speed_of_a_banked_curve_the_tyres_carry_nothing_across(d
     assert np.sqrt(-offset / slope) == pytest.approx(np.sqrt(G * radius * BANK), rel=0.02)
 
 
+@pytest.mark.slow
 def test_a_tilted_road_is_tilted_gravity_of_the_c_engine(drive):
     """2 s of random controls: float32 and two iterations against float64 to convergence."""
     controls, speed = random_controls(3, 2, 15), np.linspace(4, 14, 8)

@@ -122,6 +122,7 @@ def test_who_may_be_an_adversary_and_why_not(loaded, settings):
     assert dict(zip(names, chosen.steers[2][chosen.eligible[2]].tolist(), strict=True)) == {CROSSER: True, TURNING: False}
 
 
+@pytest.mark.slow
 def test_a_contact_from_behind_is_none_of_the_ego(loaded):
     """An ego that stands is run into by its follower: touched, but no contact that counts. Across the follower's way, it is one."""
     row = loaded.reports[1].traffic_ids.index(FOLLOWER)

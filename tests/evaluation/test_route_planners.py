@@ -72,6 +72,7 @@ def idm(env, scene):
     return run(env, scene, "idm_route")
 
 
+@pytest.mark.slow  # test_pdm_closed drives a planner of routes, tests below have the parts
 def test_both_follow_bends_to_their_goals(env, scene, idm):
     pursuit = run(env, scene, "route_pursuit", seconds=25)
     for metrics, events, _, active in (idm, pursuit):
@@ -83,6 +84,7 @@ def test_both_follow_bends_to_their_goals(env, scene, idm):
     assert np.where(active, metrics.speed, 0.0)[90:110, 0].max() > 4.0
 
 
+@pytest.mark.slow
 def test_idm_stands_before_the_light_the_sign_and_the_car(idm):
     metrics, events, actions, _ = idm
     assert not events.red_light.any() and not events.stop_sign.any()

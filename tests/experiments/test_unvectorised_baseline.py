@@ -124,6 +124,7 @@ def look(task, place, state):
     return [baseline_environment.look(task, place, agent, crowd) if agent.active else None for agent in agents]
 
 
+@pytest.mark.slow
 def test_every_agent_sees_what_it_sees_on_the_device(task, scene, reference, moments):
     place = one.place_of(scene, float(moments[0][1].weather.film_mm), int(moments[0][1].weather.surface))
     most = 0
@@ -143,6 +144,7 @@ def test_every_agent_sees_what_it_sees_on_the_device(task, scene, reference, mom
     assert most == task.groups["road"].keywords["count"]  # some place held more than an agent may see
 
 
+@pytest.mark.slow
 def test_rewards_and_events_are_those_of_the_device(task, scene, reference, moments, config):
     place = one.place_of(scene, 0.0, 0)
     met = set()

@@ -137,6 +137,7 @@ def test_probes_4_and_5_actions(learner):
     assert all(np.isfinite(value) for value in metrics.values()) and metrics["ppo/skipped"] == 0.0
 
 
+@pytest.mark.slow
 def test_agents_that_gain_from_each_other_become_altruists(learner):
     """An agent's throttle costs it a half and pays its neighbour 1: PPO brakes, at a reward of -0.5 each; altruists have 0.5."""
     state, metrics, look = train_on(learner, GAME, 30)

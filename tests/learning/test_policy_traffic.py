@@ -4,7 +4,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from support.choosing import slow_except
 from support.hand_scenes import column_of, scene_of
 from support.policy_traffic import (
     ABSENT,
@@ -216,7 +215,8 @@ def test_who_stands_walks_or_has_no_slot_follows_the_log(folder, monkeypatch):
     assert start(jnp.int32(0)).present.tolist() == [False, False, False, False, True]
 
 
-@pytest.mark.parametrize("at_end", slow_except(["leave", "park", "restart"], "leave"))
+@pytest.mark.slow
+@pytest.mark.parametrize("at_end", ["leave", "park", "restart"])
 def test_a_vehicle_that_arrives_does_as_the_config_says(folder, monkeypatch, at_end):
     constant(monkeypatch, folder, 0.05)  # about as much as it rolls off
     state, boxes = simulate(make(folder, at_end=at_end), street(cars=[[0.0, 0.0]], speeds=[10.0], steps=11), steps=60)

@@ -68,7 +68,7 @@ def test_gaussians_agree_with_their_definitions():
     assert np.abs(kl_divergence(mean, log_std, mean, log_std)).max() == 0.0
 
 
-@pytest.fixture(scope="module", params=[False, True])
+@pytest.fixture(scope="module", params=slow_except([False, True], True))
 def batch(request):
     """Policy, parameters and samples; every third one without weight."""
     policy, count = late_fusion.make(**SMALL | {"actor_head_scale": 0.5}, state_dependent_std=request.param), 24

@@ -2,13 +2,18 @@
 
 import re
 
+import jax
+import jax.numpy as jnp
 import pytest
+from support.choosing import slow_except
 from support.running import ROOT
 
 import scenefactory_jax as sf
 from scenefactory_jax.cli import hydra_config
+from scenefactory_jax.data.loading import scene_source
+from scenefactory_jax.env import environment
 from scenefactory_jax.evaluation.metrics import agent_metrics
-from scenefactory_jax.learning import run_paths
+from scenefactory_jax.learning import policy_io, run_paths
 
 SHIPPED = [file.parent for file in sorted(run_paths.SHIPPED.glob("*/config.yaml"))]
 TOWN = run_paths.SHIPPED / "town" / "README.md"
@@ -28,13 +33,26 @@ def test_a_policy_was_trained_on_generated_scenes(folder):
     assert scenes["generate"]["_target_"].startswith("scenefactory_jax.data.generators.") and scenes["seed"] != scenes["heldout"]["seed"]
 
 
+@pytest.mark.parametrize("folder", slow_except(SHIPPED, TOWN.parent), ids=lambda folder: folder.name)
+def test_a_policy_fits_its_networks_and_observations(folder):
+    """Of this version. How well one drives is a slow test's."""
+    trained = policy_io.load_policy(folder)
+    config = hydra_config.apply_overrides(trained.config, ["scenes.heldout.count=1"])
+    scene = scene_source.load_heldout_scenes(config["scenes"], path=None)[0]
+    observed = jax.eval_shape(environment.make_env(config).reset, jax.random.key(0), scene)[1]
+    drawn = jax.eval_shape(trained.policy.init, jax.random.key(0), observed)
+    assert jax.tree.map(jnp.shape, trained.parameters) == jax.tree.map(jnp.shape, drawn)
+    action, *_ = jax.eval_shape(trained.policy.apply, trained.parameters, observed)
+    assert action.shape == (config["scenes"]["pack"]["agents"], 3)
+
+
 def drive_town(out, *, scenes, untrained, dynamics):
     overrides = f"overrides=[spawning=logged,weather=dry,dynamics={dynamics},scenes.heldout.count={scenes},timing.episode_s=12]"
     plainly = ["protocol.termination=[strict]", f"untrained={untrained}", "video.enable=false", "failures.pictures.enable=false"]
     return sf.evaluate(sf.load_config("evaluate", "run=town", f"out={out}", overrides, *plainly)).records
 
 
-@pytest.mark.slow  # others play bundled policies; how well `town` drives changes with the simulator only
+@pytest.mark.slow
 def test_town_drives_on_other_scenes(tmp_path, quickly):
     records = drive_town(tmp_path, scenes=1, untrained="false", dynamics="articulated")["strict"]
     bends = records["route_m"] >= agent_metrics.BEND * records["start_distance_m"]

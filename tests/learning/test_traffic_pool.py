@@ -81,7 +81,7 @@ def test_members_are_drawn_by_weight(runs):
 # ---- past policies
 
 
-@pytest.mark.slow  # test_sharding compiles once with past policies
+@pytest.mark.slow  # the training below compiles once with them
 def test_past_policies_are_arguments_of_the_program(runs, pasts):
     """Each world drives by the parameters of its own policy, only of slots that have one; other parameters compile nothing."""
     alone = simulate(make(runs[0]), street())[1].position[-1]

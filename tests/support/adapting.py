@@ -10,7 +10,7 @@ from scenefactory_jax.data.loading import scene_source
 
 make_pool, POOLS = episodes.make_pool, {}
 SMOKE = "experiment=smoke"
-ALONE = [SMOKE, "scenes.pack.agents=1"]
+ALONE = [SMOKE, "scenes.pack.agents=1", "dynamics=bicycle"]
 
 
 @functools.cache

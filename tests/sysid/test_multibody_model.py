@@ -240,6 +240,7 @@ def test_strips_follow_one_another_along_the_road(teacher):
         make_road(m, multibody_model.Vehicle(dataclasses.replace(teacher, grip=[1.0, 0.72])))
 
 
+@pytest.mark.slow
 def test_the_driver_changes_lanes_and_returns(teacher, unseen):
     m = next(m for m in unseen if m.name.startswith("lane_change_iso_3888_1"))
     r = record(m, reference=teacher)

@@ -163,6 +163,7 @@ def traced(simulator, row, plan):
     return jax.tree.map(lambda leaf: leaf.astype(float), path)
 
 
+@pytest.mark.slow  # these share a simulator; stages below are searched with a stand-in
 def test_pairs_are_traced_in_chunks(lesson):
     simulator, begin, own = lesson
     plan = candidate_simulation.stack_recordings(own)
@@ -197,6 +198,7 @@ def test_residuals_square_to_the_loss(lesson, config):
     )
 
 
+@pytest.mark.slow
 def test_strips_of_road_have_different_friction(lesson):
     """Beyond one metre the left wheels are on the wet, the right ones on gravel: those that grip push first, then brake."""
     simulator, begin, own = lesson
