@@ -12,6 +12,7 @@ import numpy as np
 import pyarrow as pa
 import pytest
 from support import eventful
+from support.choosing import slow_except
 from support.scene_documents import FORMATS, WOMD, checker, document, packer, parsed, thing, written
 
 from scenefactory_jax.core.raw_scene import SceneError
@@ -181,7 +182,7 @@ def options(**changes):
 
 
 # before the first catalogue, the first index, and the second index take their places
-@pytest.mark.parametrize("number", [pytest.param(1, marks=pytest.mark.slow), 2, 5])
+@pytest.mark.parametrize("number", slow_except([1, 2, 5], 5))
 def test_a_bank_whose_writing_was_killed_becomes_the_undisturbed_one(tmp_path, number):
     folder, out = tmp_path / "in", tmp_path / "bank"
     folder.mkdir()

@@ -152,6 +152,7 @@ def test_others_push_where_they_touch_wherever_the_mass_is():
     np.testing.assert_allclose(torque(jnp.zeros(2), 10.0), wanted, rtol=1e-5)
 
 
+@pytest.mark.slow
 def test_anti_lock_controller_leaves_a_gentle_brake_alone():
     """At a sixth of the brakes no wheel comes near the slip that the controller allows: both cars are the same."""
     ends = [move(place(3, speed=15.0), 60, brake=0.15, mu=[1.1, 0.9, 0.7], abs_enabled=on) for on in (True, False)]

@@ -97,6 +97,7 @@ def test_two_steps_are_enough_for_most(cases, truth):
     assert 0.8 < np.mean(off[0] < 1e-3) <= np.mean(off[1] < 1e-3) == 1.0
 
 
+@pytest.mark.slow
 def test_forces_never_pull_and_do_what_newton_says(cases):
     """M a = smooth forces + J^T f, in the chassis' rows."""
     acceleration, force = solve(cases, iterations=4)

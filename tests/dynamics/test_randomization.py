@@ -196,6 +196,7 @@ def test_a_fleet_of_the_same_drives_like_the_car():
     np.testing.assert_allclose(other.qvel[..., :6], one.qvel[..., :6], atol=0.1)
 
 
+@pytest.mark.slow  # these share a program; above, fitted models are the compiled ones
 def test_axles_carry_what_statics_say():
     """Centre of mass forward by a: the front axle carries W (1/2 + a/L)."""
     forward = [0.0, 0.0, 0.0, 0.3, -0.25, 0.0, 0.1, -0.1]
@@ -210,6 +211,7 @@ def test_axles_carry_what_statics_say():
     assert np.abs(pitch).max() < 5e-3  # the springs' preload follows the load: all stand level
 
 
+@pytest.mark.slow
 def test_cars_of_another_size_accelerate_and_stop_like_the_reference():
     sizes = np.float32([[4.0, 2.0], [4.0, 2.0], [12.0, 2.5], [2.5, 1.2], [5.0, 2.0], [4.0, 1.6], [3.2, 1.6], [6.0, 2.4]])
     resized = resize(stacked([CAR] * 8), sizes)
@@ -229,6 +231,7 @@ def test_cars_of_another_size_accelerate_and_stop_like_the_reference():
     assert motion.upright.min() > 0.99
 
 
+@pytest.mark.slow
 def test_mass_reaches_the_contact():
     """Car 1 into car 0, 3 into 2 and 7 into 6, at 10 m/s. Momentum stays; and twice as heavy a pair pushes itself apart twice as hard."""
     crew = [changed(mass=3.0), changed(mass=0.8), *[changed(mass=3.0)] * 2, *[CAR] * 4]
@@ -263,6 +266,7 @@ def test_long_vehicles_carry_their_mass_high_and_far_back(length, width):
     assert 0.5 * bus.track / height > 0.9, "it slides before it tips at a friction of 0.9"
 
 
+@pytest.mark.slow
 def test_a_bus_stands_and_turns_without_tipping_over():
     """Eight buses and trucks: 3 s at rest, then 4 s in a turn of 3 m/s^2 at 10 m/s."""
     sizes = np.tile(np.float32([[12.0, 2.5], [9.0, 2.4], [7.0, 2.2], [12.0, 2.6]]), (2, 1))

@@ -41,6 +41,7 @@ def rolling(body):
     return radius, total_mass(FREE) + 4 * FREE.wheel_inertia[0] / radius**2
 
 
+@pytest.mark.slow  # these share a program; test_dynamics stops with both
 def test_rolling_resistance_slows_a_car_evenly_and_then_holds_it():
     torque = np.array([0.0, 10.0, 15.0, 20.0, 30.0, 40.0, 50.0, 60.0])
     several = crew("rolling_torque", torque)
@@ -70,6 +71,7 @@ def test_an_engine_below_the_rolling_resistance_does_not_move_the_car():
     np.testing.assert_allclose(motion.velocity[-1, ~held, 0] / 3.0, free, rtol=0.06)
 
 
+@pytest.mark.slow
 def test_air_drag_is_the_square_of_speed():
     """Coasting m v' = -c v^2: v0 / (1 + c v0 t / m). Under the engine m v' = F - c v^2: tanh, up to the square root of F / c."""
     drag = np.array([0.0, 0.4, 1.0, 2.0, 5.0, 10.0, 20.0, 50.0])

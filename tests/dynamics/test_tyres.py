@@ -123,6 +123,7 @@ def test_a_steeper_grade_than_the_friction_holds_slides():
     assert (after.qvel[:2, 0] > 0.5).all() and np.abs(after.qvel[2:, 0]).max() < 1e-3
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("speed", [0.0, 0.3, 12.0])
 def test_stable_at_any_friction_and_speed(speed):
     """10 s sideways, straight and braked, from no speed to 12 m/s: all ends at rest, without shaking."""

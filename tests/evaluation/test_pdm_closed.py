@@ -195,6 +195,7 @@ def test_scores_of_a_free_street_grow_with_progress(score):
     assert (found.total.argmax(axis=1) == len(FRACTIONS) - 1).all() and np.isinf(found.collision_s).all()
 
 
+@pytest.mark.slow
 def test_a_car_that_cuts_in_is_a_collision_at_fault_and_one_from_behind_is_not(score):
     run, view = score
     crossing = run(users=user_at(view, 14.0, -12.0, vy=6.0, yaw=np.pi / 2))  # on the street after 2 s, where the fast proposals are
@@ -206,6 +207,7 @@ def test_a_car_that_cuts_in_is_a_collision_at_fault_and_one_from_behind_is_not(s
     assert (rear.no_collision[0] == 1.0).all()
 
 
+@pytest.mark.slow
 def test_edges_rule_out_the_paths_that_touch_them(score):
     run, view = score
     edges = view.edges

@@ -94,7 +94,7 @@ def scores():
     return {name: values[0] for name, values in found.values.items()}, {name: mask[0] for name, mask in found.failures.items()}
 
 
-@pytest.mark.slow  # test_episode_metrics has collisions and faults
+@pytest.mark.slow  # these share a program; test_vmax_golden has scores, test_planner_evaluation writes them
 def test_a_car_that_hits_one_that_stands_is_at_fault():
     found, _ = scores()
     assert found["overlap"].tolist() == [1, 1]
@@ -107,6 +107,7 @@ def test_a_car_that_hits_one_that_stands_is_at_fault():
     assert found["nuplan_speed_compliance"][0] == 1  # 8 m/s where 10 are allowed
 
 
+@pytest.mark.slow
 def test_failures_are_marked_from_the_state_in_which_they_happen():
     """The overlap of the state 2.1 s after the start is marked in control step 62, its last; later states do not count."""
     _, failures = scores()
@@ -127,6 +128,7 @@ def test_scores_are_in_the_slots_of_their_agents():
     assert np.isnan(spread[~present]).all() and scoring.spread_agents(np.zeros((3, 1), bool), present, False).dtype == bool
 
 
+@pytest.mark.slow
 def test_road_users_have_masses():
     start = episode()[1]
     assert scores()[0]["delta_v_mps"][0] == SPEED / 2  # between two equal cars
@@ -136,6 +138,7 @@ def test_road_users_have_masses():
     assert found.tolist() == [1980.0, 1980.0, 2000.0, 80.0]
 
 
+@pytest.mark.slow
 def test_an_episode_ends_at_its_failure():
     """The rectangles overlap once the car has driven 16 m, at a state 2.1 s after the start; the standing car's episode ends there, too."""
     found, _ = scores()
@@ -145,6 +148,7 @@ def test_an_episode_ends_at_its_failure():
     assert found["cost"][1] == 1
 
 
+@pytest.mark.slow
 def test_what_a_scene_lacks_has_no_value():
     found, _ = scores()
     assert np.isnan(found["red_light_run"]).all()  # no lights

@@ -166,6 +166,7 @@ def test_rewards_and_events_are_those_of_the_device(task, scene, reference, mome
     assert met == {None, *EVENTS} - {"numerical_error", "red_light", "stop_sign", "off_route"}
 
 
+@pytest.mark.slow
 def test_numpy_network_is_the_policy(task, scene, reference, moments, parameters, config):
     observations = [reference[1](scene, state) for _, state in moments[:4]]
     observation = jax.tree.map(lambda *leaves: jnp.stack(leaves), *observations)
@@ -235,6 +236,7 @@ def test_a_broken_number_ends_everybody_with_a_fault(task, scene, tmp_path, monk
     assert all(agent.past_events == {"numerical_error"} for agent in whole.agents)
 
 
+@pytest.mark.slow
 def test_measure_gives_positive_numbers(config, scene, parameters):
     short = {
         **config,

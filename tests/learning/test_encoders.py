@@ -30,14 +30,15 @@ SIZES = {
 }
 OBSERVATIONS = {"own": ({}, observe(0)), "vmax": (VMAX, observe_vmax(0))}
 CASES = [(name, kind) for name in ENTRIES for kind in OBSERVATIONS]
-LARGE = ("lq", "lqh", "mtr", "wayformer")  # of attention, which compiles long; `lq` stays among the fast tests
+LARGE = ("lq", "lqh", "mtr", "wayformer")  # of attention, which compiles long; test_attention_kernel has their parts
+QUICK = [case for case in CASES if case[0] not in LARGE]
 
 
 def count(network, *inputs):
     return sum(leaf.size for leaf in jax.tree.leaves(jax.eval_shape(network.init, jax.random.key(0), *inputs)))
 
 
-@pytest.mark.parametrize("name", slow_except(SIZES, "none", "mlp", "lq"))
+@pytest.mark.parametrize("name", slow_except(SIZES, "none", "mlp"))
 def test_encoders_have_the_published_sizes(name):
     config = configs.load_config("train", "observations=vmax_road", "policy=actor_critic", f"policy/encoder={name}")
     entry, hidden, groups = config["policy"]["encoder"], config["policy"]["hidden"], config["observations"]
@@ -58,7 +59,7 @@ def built(name, kind):
     return module, draw(module, observation), jax.jit(module.apply)
 
 
-@pytest.mark.parametrize(("name", "kind"), slow_except(CASES, *[case for case in CASES if case[0] not in LARGE or case == ("lq", "own")]))
+@pytest.mark.parametrize(("name", "kind"), slow_except(CASES, *QUICK))
 def test_any_leading_axes_give_the_same_numbers(name, kind):
     _, parameters, apply = built(name, kind)
     observation = OBSERVATIONS[kind][1]
@@ -84,7 +85,10 @@ def poison(observation):
     return {"vmax": flat}
 
 
-@pytest.mark.parametrize(("name", "kind"), [case for case in CASES if case != ("none", "vmax")])  # which reads the vector as it is
+VALIDATED = [case for case in CASES if case != ("none", "vmax")]  # which reads the vector as it is
+
+
+@pytest.mark.parametrize(("name", "kind"), slow_except(VALIDATED, *[case for case in QUICK if case in VALIDATED]))
 def test_what_is_not_valid_changes_nothing(name, kind):
     _, parameters, apply = built(name, kind)
     observation = OBSERVATIONS[kind][1]
@@ -93,7 +97,7 @@ def test_what_is_not_valid_changes_nothing(name, kind):
     np.testing.assert_allclose(apply(parameters, poisoned), apply(parameters, observation), atol=1e-5)
 
 
-@pytest.mark.parametrize("name", slow_except(ENTRIES, *[name for name in ENTRIES if name not in LARGE or name == "lq"]))
+@pytest.mark.parametrize("name", slow_except(ENTRIES, *[name for name in ENTRIES if name not in LARGE]))
 def test_gradients_are_finite_and_reach_every_parameter(name):
     module, parameters, _ = built(name, "vmax")
     observation = OBSERVATIONS["vmax"][1]
@@ -193,7 +197,7 @@ def test_late_fusion_reads_own_groups_as_they_are():
     }  # fmt: skip
 
 
-@pytest.mark.parametrize("name", slow_except(["mlp", "lq", "mtr"], "mlp", "lq"))
+@pytest.mark.parametrize("name", slow_except(["mlp", "lq", "mtr"], "mlp"))
 def test_bfloat16_is_near_float32_and_not_in_parameters(name):
     _, parameters, apply = built(name, "vmax")
     observation = OBSERVATIONS["vmax"][1]

@@ -37,7 +37,7 @@ OBSERVATION = observe(0)
 ACTION = jax.device_put(np.random.default_rng(1).normal(size=(2, 3, 2)).astype(np.float32))
 
 
-@pytest.fixture(scope="module", params=["lq", "late_fusion"])
+@pytest.fixture(scope="module", params=slow_except(["lq", "late_fusion"], "late_fusion"))
 def critic(request):
     """The network, its parameters, and its values and their gradients as a compiled function."""
     network = heads.make_critic(encoding.make_encoder(request.param), 2, **HEAD)

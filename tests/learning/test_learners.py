@@ -153,12 +153,12 @@ def test_probes_1_to_3_values(course, name):
     np.testing.assert_allclose(train_on(course, name, 3, 40)[2](0.0, 1.0)[1], [[0.9, 1.0]] * 2, atol=0.06)  # alpha pays for entropy
 
 
-@pytest.mark.parametrize("name", ["sac", "td3"])
+@pytest.mark.parametrize("name", slow_except(["sac", "td3"], "sac"))
 def test_probe_4_action(course, name):
     np.testing.assert_allclose(train_on(course, name, 4, 40)[2](0.0, 0.0)[0][:, 0], [0.5, 0.5], atol=0.12)
 
 
-@pytest.mark.parametrize("name", slow_except(LEARNERS, "sac", "td3"))
+@pytest.mark.parametrize("name", slow_except(LEARNERS, "sac"))
 def test_probe_5_action_that_depends_on_the_observation(course, name):
     """Learners that imitate steer, too, as the expert does; what it does where that is not known they do not learn."""
     _, metrics, look = train_on(course, name, 5, 40)
@@ -171,7 +171,7 @@ def test_probe_5_action_that_depends_on_the_observation(course, name):
     assert all(np.isfinite(value) for value in metrics.values())
 
 
-@pytest.mark.parametrize("name", list(LEARNERS))
+@pytest.mark.parametrize("name", slow_except(LEARNERS, "sac"))
 def test_a_killed_and_resumed_run_is_the_unbroken_one(course, name, tmp_path):
     learner, stage = course(name)[1], scenes(WORLDS)
     unbroken, _ = check_resumed_is_unbroken(learner, stage, tmp_path)
@@ -233,6 +233,7 @@ def test_critics_are_independent_and_targets_follow_them(course):
     assert 0.0 < distance(state.learner["sac"].target) < distance(state.learner["sac"].critics)
 
 
+@pytest.mark.slow
 def test_the_actor_of_td3_waits():
     policy = late_fusion.make(**SMALL, actor="deterministic", numbers=2)
     learner = td3.make_learner(policy, schema.read({**LEARNERS["td3"], "policy_delay": 3}, TD3Config, where="learner"), None)

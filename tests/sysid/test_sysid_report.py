@@ -102,6 +102,7 @@ def test_a_response_that_is_not_defined_is_a_miss(result):
     assert rise.measured == "nan %" and not rise.met
 
 
+@pytest.mark.slow  # the next one writes the committed report
 def test_the_report_is_written_from_its_results(tmp_path, result):
     text = report.write(tmp_path, result, TARGETS, SPINS).read_text()
     assert "98 candidates of two structures in 0.4 minutes" in text

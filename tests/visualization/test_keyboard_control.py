@@ -82,6 +82,7 @@ def driven(built, script, drive=None):
     return drive
 
 
+@pytest.mark.slow  # these share a program; parts of the keyboard are above
 def test_a_script_of_keys_drives_one_car_and_leaves_the_other_alone(built):
     begun = keyboard_control.start(built, seed=0)
     fast = driven(built, [(60, {"throttle"}, ())])
@@ -96,11 +97,13 @@ def test_a_script_of_keys_drives_one_car_and_leaves_the_other_alone(built):
     assert float(begun.state.motion.position[1, 0]) == -50.0
 
 
+@pytest.mark.slow
 def test_the_driven_car_has_no_goal_that_ends_it(built):
     far = driven(built, [(90, {"throttle"}, ())])
     assert far.shot.position[1, 0] > -44.0 and bool(far.state.active[1]) and far.resets == 0
 
 
+@pytest.mark.slow
 def test_pause_holds_the_world_and_reset_starts_anew(built):
     moved = driven(built, [(20, {"throttle"}, ())])
     paused = driven(built, [(10, {"throttle"}, ("pause",))], moved)
@@ -115,6 +118,7 @@ def test_pause_holds_the_world_and_reset_starts_anew(built):
         np.testing.assert_array_equal(before, now)
 
 
+@pytest.mark.slow
 def test_a_broken_car_starts_again(built):
     moved = driven(built, [(5, NONE, ())])
     broken = moved._replace(state=jax.tree.map(lambda leaf: leaf, moved.state))
@@ -122,6 +126,7 @@ def test_a_broken_car_starts_again(built):
     assert driven(built, [(1, NONE, ())], broken).resets == 1
 
 
+@pytest.mark.slow
 def test_a_car_off_the_map_starts_again(built):
     """Beside the road it drives on; farther from its last line than `off_map_m` it is back at the start."""
     near, drive, farthest = built._replace(off_map_m=5.0), keyboard_control.start(built, seed=0), 0.0
@@ -136,10 +141,12 @@ def test_a_car_off_the_map_starts_again(built):
     assert float(drive.state.motion.position[1, 1]) == -3.0
 
 
+@pytest.mark.slow
 def test_the_camera_key_frees_the_camera(built):
     assert not driven(built, [(2, NONE, ("camera",))]).chasing
 
 
+@pytest.mark.slow
 def test_the_dashboard_reads_the_car(built):
     drive = driven(built, [(30, {"throttle"}, ())])
     names, values = window.dashboard(drive, built)
