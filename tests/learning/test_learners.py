@@ -179,6 +179,7 @@ def test_a_killed_and_resumed_run_is_the_unbroken_one(course, name, tmp_path):
     jax.tree.map(np.testing.assert_array_equal, parameters, get_policy_parameters(unbroken))
 
 
+@pytest.mark.slow  # of bc_sac, which no other fast test compiles
 def test_the_running_mean_of_an_actor_is_evaluated(course):
     learner, stage = course("bc_sac")[1], scenes(WORLDS)
     state = learner.init(jax.random.key(0), stage)
