@@ -153,12 +153,7 @@ def find_crossings(
     time, part = cross(apart, along) / angle, cross(apart, velocity) / angle
     place = window.arc[:, None, :-1] + part * length
     found = steep & (time >= 0.0) & (time <= foresight_s) & (part >= 0.0) & (part <= 1.0) & (place >= arc[:, None, None])
-    if window.height is not None:
-        found &= _find_level(window.height, elevation)
-    place = jnp.where(found, place, jnp.inf)
-    first = jnp.argmin(place, axis=2)[..., None]
-    nearest, time = (jnp.take_along_axis(table, first, axis=2)[..., 0] for table in (place, time))
-    return Crossings(nearest, jnp.where(jnp.isfinite(nearest), time, jnp.inf))
+    return _find_first(window, found, place, time, elevation)
 
 
 def find_merges(
@@ -178,9 +173,16 @@ def find_merges(
     time = dot(apart, velocity) / jnp.maximum(speed, SMALLEST) ** 2
     away = jnp.abs(cross(velocity, apart)) / jnp.maximum(speed, SMALLEST)
     found = (speed > 0) & (time >= 0) & (time <= foresight_s) & (away <= beside_m) & (window.arc >= arc[:, None])[:, None]
+    return _find_first(window, found, window.arc[:, None], time, elevation)
+
+
+def _find_first(
+    window: Window, found: Bool[Array, "V N K"], place: Float[Array, "V #N K"], time: Float[Array, "V N K"], elevation: Float[Array, "V N"]
+) -> Crossings:
+    """The first place along each route of those that are found, on the other's level."""
     if window.height is not None:
         found &= _find_level(window.height, elevation)
-    place = jnp.where(found, window.arc[:, None], jnp.inf)
+    place = jnp.where(found, place, jnp.inf)
     first = jnp.argmin(place, axis=2)[..., None]
     nearest, time = (jnp.take_along_axis(table, first, axis=2)[..., 0] for table in (place, time))
     return Crossings(nearest, jnp.where(jnp.isfinite(nearest), time, jnp.inf))
