@@ -123,6 +123,16 @@ def test_a_collision_costs_6_from_25_newtons_on_after_24_steps(force, age, costs
     assert paid([[0.0, 0.0]], [[0.2, 0.0]], force=force, age=age)["collision"] == costs
 
 
+def test_no_event_of_the_recipe_is_cheaper_than_to_stand_for_ever():
+    """Else cars that are held up end their episode by one: half of all collisions were slower than those that had a price."""
+    config = load_config("train", "experiment=generalist_finetune")
+    reward = {name: term for name, term in config["reward"].items() if term}
+    standing = reward["slow_progress"]["weight"] * config["actions"]["action_repeat"] / (1.0 - config["ppo"]["gamma"])
+    events = {term["name"]: term["weight"] for term in reward.values() if term["_target_"] == "event" and term["name"] != "goal_reached"}
+    assert {"collision", "road_edge_contact", "out_of_bounds", "off_route", "red_light", "stop_sign"} <= set(events)
+    assert max(events.values()) < standing < 0.0
+
+
 def test_a_car_that_stands_and_is_hit_is_in_no_moving_collision():
     """Two cars, of which the first stands."""
     places = [[0.0, 0.0], [8.0, 0.0]]
