@@ -1,8 +1,8 @@
 """Events against years of driving, while training: a figure and a table from metrics.csv of one run or more.
 
-python -m experiments.drive.events --runs generalist=runs/g-0,runs/g-1,runs/g-2 small=runs/s-0 [--bins 20] [--out experiments/drive]
+python -m experiments.drive.events --runs generalist=runs/g-0,runs/g-1,runs/g-2 small=runs/s-0+runs/s-1 [--bins 20] [--out experiments/drive]
 
-Years are those of active agents. Runs of one name are its seeds: rates are of all of them together, brackets are 95 % intervals over the
+A `+` joins the parts of a training, one that started from the other. Years are those of active agents. Runs of one name are its seeds: rates are of all of them together, brackets are 95 % intervals over the
 runs (t, of the logarithm), of a single run those of a Poisson count. Training samples its actions, and its scenes are those that fail:
 rates of evaluations are lower. Writes `events.png`, `events.md` and `events.json`.
 """
@@ -37,12 +37,14 @@ EVENTS = {  # name in the figure -> columns of metrics.csv
 Curve = dict[str, list[float | None]]
 
 
-def read_run(folder: Path) -> dict[str, Float[np.ndarray, " I"]]:
-    """Reads the years driven in each iteration of a run, the hours that it took and its events."""
-    rows = metrics_csv.read(folder)
-    if not rows:
-        raise SystemExit(f"--runs: {folder}: no {metrics_csv.FILE}; give folders that `train` wrote")
-    hertz = run_config.read_values(folder)["timing"]["control_hz"]
+def read_run(folders: Sequence[Path]) -> dict[str, Float[np.ndarray, " I"]]:
+    """Reads the years driven in each iteration of a run, part after part, the hours that it took and its events."""
+    rows: list[dict[str, float]] = []
+    for folder in folders:
+        rows += (part := metrics_csv.read(folder))
+        if not part:
+            raise SystemExit(f"--runs: {folder}: no {metrics_csv.FILE}; give folders that `train` wrote")
+    hertz = run_config.read_values(folders[-1])["timing"]["control_hz"]
     column = lambda name: np.array([row.get(name, 0.0) for row in rows])  # noqa: E731
     events = {event: sum(map(column, names), np.zeros(len(rows))) for event, names in EVENTS.items()}
     return {"years": column("steps/active") / hertz / YEAR_S, "hours": column("seconds") / 3600.0, **events}
@@ -112,7 +114,8 @@ def main() -> None:
     parser.add_argument("--bins", type=int, default=20)
     parser.add_argument("--out", type=Path, default=HERE)
     given = parser.parse_args()
-    named = {name: [read_run(Path(folder)) for folder in folders] for name, folders in evaluations.parse_runs(given.runs).items()}
+    read = lambda run: read_run([Path(part) for part in run.split("+")])  # noqa: E731
+    named = {name: [read(run) for run in runs] for name, runs in evaluations.parse_runs(given.runs).items()}
     curves = {name: make_curves(runs, given.bins) for name, runs in named.items()}
     years = {name: float(np.mean([run["years"].sum() for run in runs])) for name, runs in named.items()}
     speed = {name: float(np.mean([run["years"].sum() / run["hours"].sum() for run in runs])) for name, runs in named.items()}

@@ -184,7 +184,9 @@ def main() -> None:
     given.out.mkdir(parents=True, exist_ok=True)
     runs = {name: tuple(folders) for name, folders in evaluations.parse_runs(given.runs).items()}
     drivers = {**{planner: ((), planner) for planner in given.planners}, **{name: (folders, None) for name, folders in runs.items()}}
-    command = " ".join(["python -m experiments.drive.table --runs", *given.runs, "--scenes", *given.scenes, "--planners", *given.planners])
+    rows = [] if given.rows == list(ROWS) else ["--rows", *given.rows]
+    words = ["--runs", *given.runs, "--scenes", *given.scenes, "--planners", *given.planners, *rows]
+    command = " ".join(["python -m experiments.drive.table", *words])
     path = given.out / "table.json"
     result: dict[str, Any] = result_file.read(path) if path.exists() else {"commands": [], "runs": {}, "sets": {}}
     result["commands"] += [command] if command not in result["commands"] else []
