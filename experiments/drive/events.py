@@ -1,10 +1,11 @@
 """Events against years of driving, while training: a figure and a table from metrics.csv of one run or more.
 
-python -m experiments.drive.events --runs generalist=runs/g-0,runs/g-1,runs/g-2 small=runs/s-0+runs/s-1 [--bins 20] [--out experiments/drive]
+python -m experiments.drive.events --runs generalist=runs/g-0,runs/g-1,runs/g-2 small=runs/s-0+runs/s-1 [--bins 20]
 
-A `+` joins the parts of a training, one that started from the other. Years are those of active agents. Runs of one name are its seeds: rates are of all of them together, brackets are 95 % intervals over the
-runs (t, of the logarithm), of a single run those of a Poisson count. Training samples its actions, and its scenes are those that fail:
-rates of evaluations are lower. Writes `events.png`, `events.md` and `events.json`.
+A `+` joins the parts of a training, one that started from the other. Years are those of active agents. Runs of one name are its seeds:
+rates are of all of them together, brackets are 95 % intervals over the runs (t, of the logarithm), of a single run those of a Poisson
+count. Training samples its actions, and its scenes are those that fail: rates of evaluations are lower.
+Writes `events.png`, `events.md` and `events.json`.
 """
 
 import argparse

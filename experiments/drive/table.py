@@ -9,6 +9,7 @@ Writes `table.md` and `table.json`; what an earlier call has written there stays
 """
 
 import argparse
+import functools
 import time
 from collections import Counter
 from collections.abc import Callable, Mapping
@@ -19,6 +20,7 @@ import numpy as np
 
 from experiments.drive import evaluations
 from experiments.drive.evaluations import Asked
+from scenefactory_jax.cli import hydra_config
 from scenefactory_jax.core import config as run_config
 from scenefactory_jax.core import markdown, result_file
 from scenefactory_jax.data.loading import scene_source
@@ -116,10 +118,10 @@ ROWS = {
 def measure(row: Row, runs: tuple[str, ...], planner: str | None, scenes: str, given: argparse.Namespace) -> dict[str, Any]:
     """Measures the numbers of a row: label -> estimate; a number that nothing has is left out, and without recorded drivers what needs
     them."""
-    asked, numbers = _ask(row, runs, planner, scenes, given), {}
+    asked, numbers = ask(row, runs, planner, scenes, given), {}
     found, device = evaluations.evaluate(asked, given.kept), evaluations.find_device(asked, given.kept)
     needed = RECORDED in given.planners and any(number.if_recorded for number in row.numbers)
-    recorded = evaluations.evaluate(_ask(row, (), RECORDED, scenes, given), given.kept)[0] if needed else None
+    recorded = evaluations.evaluate(ask(row, (), RECORDED, scenes, given), given.kept)[0] if needed else None
     for number in row.numbers:
         if number.if_recorded and recorded is None:
             continue
@@ -131,8 +133,15 @@ def measure(row: Row, runs: tuple[str, ...], planner: str | None, scenes: str, g
     return numbers
 
 
-def _ask(row: Row, runs: tuple[str, ...], planner: str | None, scenes: str, given: argparse.Namespace) -> Asked:
-    towns = TOWNS if scenes == "null" else ()
+@functools.cache
+def list_town_settings() -> tuple[str, ...]:
+    """Lists the settings of the generator that a recipe changes, as they are for planners: all are judged in the same towns."""
+    network = hydra_config.load_config("train", "scenes=town")["scenes"]["generate"]["network"]
+    return (f"scenes.generate.network.motorway_fraction={network['motorway_fraction']}",)
+
+
+def ask(row: Row, runs: tuple[str, ...], planner: str | None, scenes: str, given: argparse.Namespace) -> Asked:
+    towns = (*TOWNS, *(() if planner else list_town_settings())) if scenes == "null" else ()
     overrides = (*row.overrides, *(row.of_planners if planner else row.of_runs), *towns, *given.overrides)
     return Asked(runs, planner, row.protocol, overrides, None if scenes == "null" else scenes)
 

@@ -1,18 +1,22 @@
 """Tables of the long trainings: events a year, time to notice ice, targets and cross-play, from numbers whose results are known."""
 
 
+import argparse
+
 import numpy as np
 import pytest
 from support.agent_records import records
 
-from experiments.drive import evaluations, events, ice_onset, table
+from experiments.drive import evaluations, events, failures, ice_onset, table
 from experiments.drive.evaluations import Asked
 from experiments.population import cross_play
+from scenefactory_jax.cli import hydra_config
 from scenefactory_jax.core import config as run_config
 from scenefactory_jax.core import result_file
 from scenefactory_jax.evaluation import protocols
 from scenefactory_jax.evaluation.metrics import score_metrics
 from scenefactory_jax.evaluation.metrics.agent_metrics import METRICS
+from scenefactory_jax.learning import run_paths
 from scenefactory_jax.learning.training_loop import YEAR_S, count_years
 from scenefactory_jax.loggers import metrics_csv
 
@@ -56,6 +60,9 @@ def test_events_of_runs_against_years(tmp_path, monkeypatch, undrawn_figures):
     np.testing.assert_allclose(curve["collision"]["years"], [0.01, 0.02, 0.03, 0.04], rtol=1e-4)
     text = (tmp_path / "out" / "events.md").read_text()
     assert "| ours | 0.04 | 0.00333 | 1,200 [" in text and "Years are those of active agents" in text
+    joined = events.read_run([tmp_path / name for name in ("a", "b")])
+    np.testing.assert_allclose(joined["years"].sum(), 0.08, rtol=1e-4)
+    np.testing.assert_array_equal(joined["collision"], np.tile([8.0] * 6 + [4.0] * 6, 2))
 
 
 # ---- ice
@@ -109,6 +116,24 @@ def test_every_row_asks_for_episodes_that_there_are(name):
     planned, _ = evaluations.compose(Asked((), "idm_route", row.protocol, (*row.overrides, *row.of_planners, *table.TOWNS), None))
     assert planned["scenes"]["pack"]["routes"], "a planner without a route does not move"
     assert planned["policy"]["_target_"].endswith("idm_route.make") and planned["scenes"]["heldout"]["count"] == 64
+
+
+def test_runs_and_planners_are_judged_in_the_same_towns():
+    """A recipe may train in others: `generalist_finetune` has more motorways, in which fewer starts have room."""
+    given = argparse.Namespace(overrides=[])
+    run, planner = (table.ask(table.ROWS["route100"], *who, "null", given) for who in ((("drive",), None), ((), "idm_route")))
+    generators = [evaluations.compose(asked)[0]["scenes"]["generate"] for asked in (run, planner)]
+    assert generators[0] == generators[1]
+    assert hydra_config.read(run_paths.find("drive"))["scenes"]["generate"] != generators[0]
+
+
+def test_failures_are_counted_by_kind():
+    kinds = np.array(["none", "struck", "at_fault", "stuck"])
+    events_of = np.array(["none", "collision", "collision", "none"])
+    run = {"failure": kinds, "first_event": events_of, "event_mps": np.array([0.0, 0.1, 3.0, 0.0])}
+    found = failures.count_kinds({0: run, 1: run})
+    assert found["agents"] == "8" and found["collision, struck"] == found["stuck"] == "25.0 %" and "road edge" not in found
+    assert found["of collisions: slower than 0.5 m/s"] == "50 %"
 
 
 def test_the_table_has_what_was_measured_once(tmp_path, monkeypatch):
