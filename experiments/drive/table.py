@@ -160,7 +160,7 @@ def write_report(result: Mapping[str, Any], path: Path) -> Path:
         rows = []
         for row in ROWS.values():
             for number in row.numbers:
-                shown = [_format(numbers.get(number.label), marks) for numbers in columns.values()]
+                shown = [format_estimate(numbers.get(number.label), marks) for numbers in columns.values()]
                 rows += [[number.label, number.aim, *shown]] if any(shown) else []
         header = ["", "aim", *(f"{driver} ({count} runs)" if (count := result["runs"].get(driver)) else driver for driver in columns)]
         lines += [f"## {name}", "", markdown.format_table(header, rows), ""]
@@ -168,13 +168,14 @@ def write_report(result: Mapping[str, Any], path: Path) -> Path:
     return path
 
 
-def _format(estimate: Mapping[str, Any] | None, marks: Mapping[str, str]) -> str:
+def format_estimate(estimate: Mapping[str, Any] | None, marks: Mapping[str, str] | None = None) -> str:
+    """Formats a number of the table with its interval, and the mark of its device; empty: not measured."""
     if estimate is None or estimate["value"] is None:
         return ""
     scale, digits, unit = (100.0, 1, " %") if estimate["unit"] == "fraction" else (1.0, 2, "")
     show = lambda value: f"{scale * value:.{digits}f}"  # noqa: E731
     interval = "" if estimate["low"] is None else f" [{show(estimate['low'])}, {show(estimate['high'])}]"
-    return show(estimate["value"]) + unit + interval + marks[estimate["device"]]
+    return show(estimate["value"]) + unit + interval + (marks[estimate["device"]] if marks else "")
 
 
 def main() -> None:

@@ -5,6 +5,7 @@ import re
 import numpy as np
 from support.running import ROOT
 
+from experiments.drive import table
 from scenefactory_jax.core import result_file
 from scenefactory_jax.evaluation import statistics
 from scenefactory_jax.visualization.report import study_report, tables
@@ -12,15 +13,17 @@ from scenefactory_jax.visualization.report import study_report, tables
 TEXT = (ROOT / "README.md").read_text()
 SAID = " ".join(TEXT.split())
 RESULTS = ROOT / "experiments"
-COLUMNS = ("rigid body", "straight for the goal", "untrained", "log replay")  # rows of the studies, in the order of the page's columns
-ROWS = [  # label, condition, metric; of the protocol in which only the goal ends an agent
-    ("success: goal reached", "original", "success_rate"),
-    ("clean success: no other event", "original", "clean_success_rate"),
-    ("clean success on bends", "original", "clean_bend_rate"),
-    ("agents in a collision", "original", "collision_rate"),
-    ("success from rest", "original, from rest", "success_rate"),
-    ("agents in a collision, from rest", "original, from rest", "collision_rate"),
-]
+COLUMNS = ("log", "route_pursuit", "idm_route", "pdm_closed", "ours")  # of the table of targets, in the order of the page's columns
+ROWS = {  # label -> set of scenes and line of the table of targets
+    "64 scenes, `route100`: clean": ("womd_test", "`route100`: clean completion"),
+    "73 scenes with lights, `route100`: clean": ("womd_links_test", "`route100`: clean completion"),
+    "recorded goals (`strict`): clean": ("womd_test", "`strict`: goal without any event"),
+    "the same on bends": ("womd_test", "the same on bends"),
+    "recorded goals among played-back traffic: clean": ("womd_test", "`strict` among played-back traffic: clean"),
+    "the same: collisions": ("womd_test", "the same: collisions"),
+    "V-Max's score": ("womd_test", "V-Max score"),
+    "nuPlan's score": ("womd_test", "nuPlan score"),
+}
 PARTS_TAKEN_OUT = ("friction", "winter", "recipe", "rewards", "network", "diversity")  # studies
 
 
@@ -31,13 +34,19 @@ def test_it_is_short_and_has_two_commands_and_a_picture():
     assert picture.stat().st_size < 600_000
 
 
-def test_results_are_those_of_the_studies():
-    studies = [result_file.read(RESULTS / name / "result.json") for name in ("floors", "navigation")]
-    found = {(row["row"], row["condition"]): row["pooled"] for study in studies for row in study["rows"] if row["protocol"] == "goal_only"}
-    for label, condition, metric in ROWS:
-        pooled = [found.get((name, condition)) for name in COLUMNS]  # recorded drivers never start from rest
-        cells = ["" if one is None else tables.format_estimate(statistics.Estimate(**one[metric])) for one in pooled]
+def test_results_are_those_of_the_table_of_targets():
+    sets = result_file.read(RESULTS / "drive" / "table.json")["sets"]
+    for label, (scenes, line) in ROWS.items():
+        cells = [table.format_estimate(sets[scenes][driver].get(line)) for driver in COLUMNS]
         assert re.sub(r" +", " ", f"| {label} | {' | '.join(cells)} |") in TEXT
+
+
+def test_the_published_task_is_as_in_navigation():
+    rows = result_file.read(RESULTS / "navigation" / "result.json")["rows"]
+    chosen = [row for row in rows if (row["row"], row["protocol"]) == ("rigid body", "goal_only")]
+    found = {row["condition"]: row["pooled"]["success_rate"] for row in chosen}
+    original, from_rest = (tables.format_estimate(statistics.Estimate(**found[name])) for name in ("original", "original, from rest"))
+    assert f"{original} of the cars reach them and {from_rest} from rest" in SAID
 
 
 def test_intervals_and_looks_are_counted():
