@@ -30,7 +30,6 @@ from scenefactory_jax.evaluation.records import Records, select_rows
 HERE = Path(__file__).parent
 TOWNS = ("scenes.heldout.path=null", "scenes.heldout.seed=2000000", "scenes.heldout.count=64")  # as in experiments/suites
 LANES = ("scenes/pack/routes=lanes",)  # a planner that follows a route has none in these protocols, and policies bring their own
-BEYOND = ("observations.route.beyond_goal=true", "+observations.ego.beyond_goal=true")  # these episodes go on behind the goal
 AMONG = ("traffic=log_playback", "scenes.pack.traffic=64")
 PLANNERS = ("log", "pure_pursuit", "route_pursuit", "idm_route", "pdm_closed")
 RECORDED = "log"  # has no way on drawn routes, and no log to follow among traffic that reacts
@@ -53,8 +52,7 @@ class Row(NamedTuple):
     overrides: tuple[str, ...]
     numbers: tuple[Number, ...]
     has_log: bool = True
-    of_runs: tuple[str, ...] = ()  # further overrides of runs
-    of_planners: tuple[str, ...] = ()  # and of planners, beside those in `conf/protocol`
+    of_planners: tuple[str, ...] = ()  # further overrides of planners, beside those in `conf/protocol`
 
 
 def count_events(records: Records) -> dict[str, np.ndarray]:
@@ -106,8 +104,8 @@ ROWS = {
     "conflict_reactive": Row(("protocol=conflict_reactive",), (), (
         Number("`conflict_reactive`: at-fault collisions", "at_fault_collision", "<= 1 %"),
     ), has_log=False),
-    "vmax": Row(("protocol=vmax",), (), (Number("V-Max score", "vmax_score", ">= 0.90"),), of_runs=BEYOND),
-    "nuplan": Row(("protocol=nuplan",), (), (Number("nuPlan score", "nuplan_score", ">= 0.90"),), of_runs=BEYOND),
+    "vmax": Row(("protocol=vmax",), (), (Number("V-Max score", "vmax_score", ">= 0.90"),)),
+    "nuplan": Row(("protocol=nuplan",), (), (Number("nuPlan score", "nuplan_score", ">= 0.90"),)),
     "recorded_routes": Row(("protocol=recorded_routes",), (), (
         Number("`recorded_routes`: red lights run, of approaches", "red_light_per_approach", "<= 0.5 %"),
         Number("`recorded_routes`: red lights run with room to stop", "avoidable_red_light_per_approach", "<= 0.5 %"),
@@ -142,7 +140,7 @@ def list_town_settings() -> tuple[str, ...]:
 
 def ask(row: Row, runs: tuple[str, ...], planner: str | None, scenes: str, given: argparse.Namespace) -> Asked:
     towns = (*TOWNS, *(() if planner else list_town_settings())) if scenes == "null" else ()
-    overrides = (*row.overrides, *(row.of_planners if planner else row.of_runs), *towns, *given.overrides)
+    overrides = (*row.overrides, *(row.of_planners if planner else ()), *towns, *given.overrides)
     return Asked(runs, planner, row.protocol, overrides, None if scenes == "null" else scenes)
 
 

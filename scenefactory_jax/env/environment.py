@@ -133,6 +133,7 @@ def make_parts(config: Mapping[str, Any]) -> EnvParts:
     """
     read = schema.read({name: config[name] for name in GROUPS if name in config}, EnvConfig)
     context: dict[str, Any] = {"physics_dt": 1.0 / read.timing.physics_hz, "control_dt": 1.0 / read.timing.control_hz}
+    context["goal_ends"] = "goal_reached" in read.termination.ending
     mu = friction.make(config["weather"]["friction"])
     package = __name__.rpartition(".")[0]
     terms = rewards.make(read.reward, **context)

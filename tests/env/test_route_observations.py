@@ -9,18 +9,18 @@ from scenefactory_jax.adapters import bounds
 from scenefactory_jax.cli.hydra_config import load_config
 from scenefactory_jax.core.pytree import replace
 from scenefactory_jax.core.types import LIGHT_STATES, Events, Motion, Routes, RouteState, SetObservation, State, TrafficControls
-from scenefactory_jax.env import observations
+from scenefactory_jax.env import environment, observations
 from scenefactory_jax.env.observations.column_bounds import compress_length
 
 GO, CAUTION, STOP = (LIGHT_STATES.index(name) for name in ("go", "caution", "stop"))
 CORNER, LENGTH, DT = 60, 100, 1 / 30
 ENTRIES = load_config("train", "observations=drive")["observations"]
 NEAREST = {"_target_": "nearest_controls", "count": 3, "radius_m": 50.0, "distance_scale_m": 20.0}
-BEYOND = {name: {**ENTRIES[kind], "beyond_goal": True} for name, kind in {"far_route": "route", "far_goal": "ego"}.items()}
+BEYOND = {name: ENTRIES[kind] for name, kind in {"far_route": "route", "far_goal": "ego"}.items()}
 NAMED = {name: ENTRIES[name] for name in ("route", "lights", "signs", "ego")}
 AGED = {"aged_lights": {**ENTRIES["lights"], "age_scale_s": 3.0}}
 BENDS = {name: load_config("train", "observations=drive_bends")["observations"][name] for name in ("bend_speed", "own_size")}
-GROUPS = observations.make(NAMED | BEYOND | AGED | BENDS | {"nearest": NEAREST}, control_dt=DT)
+GROUPS = observations.make(NAMED | AGED | BENDS | {"nearest": NEAREST}, control_dt=DT) | observations.make(BEYOND, goal_ends=False)
 AHEAD = ENTRIES["route"]["ahead_m"]
 
 
@@ -122,6 +122,14 @@ def test_behind_the_goal_the_end_of_the_route_takes_its_place():
     np.testing.assert_allclose(seen["far_goal"][0, :5], [0.2, 0, 0, 1, 0.2], atol=1e-6)
     np.testing.assert_array_equal(seen["far_goal"][1], seen["ego"][1])
     np.testing.assert_allclose([seen["route"][0, 2], seen["far_route"][0, 2]], [10 / 60, 20 / 70], rtol=1e-5)
+
+
+@pytest.mark.parametrize(("termination", "expected"), [("strict", 10 / 60), ("whole", 20 / 70)])
+def test_the_environment_tells_observations_whether_goals_end_episodes(termination, expected):
+    """Whoever evaluates a policy by a protocol that scores episodes as a whole need not know it."""
+    parts = environment.make_parts(load_config("train", "experiment=drive", f"termination={termination}"))
+    seen = parts.groups["route"](*world(place=(60.0, 20.0), yaw=np.pi / 2, arc=80.0))
+    np.testing.assert_allclose(seen[0, 2], expected, rtol=1e-5)
 
 
 def test_lights_and_signs_ahead_of_the_front_come_in_the_order_of_the_route():

@@ -24,7 +24,7 @@ def route(
     offset_scale_m: Positive,
     remaining_scale_m: Positive,
     speed_scale_mps: Positive,
-    beyond_goal: bool,
+    goal_ends: bool = True,
 ) -> Float[Array, "A F"]:
     """Points ahead on the agent's own route, in their order: what the network's vector encoder reads without sorting rows of a set.
 
@@ -34,13 +34,13 @@ def route(
     `speed_scale_mps`, 0 where none is known. Behind the goal the goal is repeated. Zeros for an agent without a route.
 
     Args:
-        beyond_goal: the end of the route takes the place of the goal: for episodes that go on behind it.
+        goal_ends: given by the environment. False: episodes go on behind the goal, and the end of the route takes its place.
     """
     agents, motion = state.agents, state.motion
     if scene.routes.length.shape[0] == 0:
         return jnp.zeros((len(state.active), HEAD + len(POINT) * len(ahead_m)), jnp.float32)
     arc = state.route.arc[:, None] + jnp.array([0.0, *ahead_m])
-    end = scene.routes.length[agents.route] if beyond_goal else agents.route_end
+    end = agents.route_end if goal_ends else scene.routes.length[agents.route]
     arc = jnp.minimum(arc, end[:, None])
     row = jnp.broadcast_to(agents.route[:, None], arc.shape)
     points, direction = route_following.find_point(scene, row, arc)

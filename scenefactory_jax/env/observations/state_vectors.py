@@ -16,15 +16,15 @@ from scenefactory_jax.weather.patches import read_condition
 
 @bound_observation(ANY, ANY, SIGNED, SIGNED, LENGTH, ANY, ANY)
 def ego(
-    scene: Scene, state: State, *, distance_scale_m: Positive, speed_scale_mps: Positive, beyond_goal: bool = False
+    scene: Scene, state: State, *, distance_scale_m: Positive, speed_scale_mps: Positive, goal_ends: bool = True
 ) -> Float[Array, "A 7"]:
     """Goal x, y in the car's frame; sine and cosine of its bearing; its distance; the car's velocity x, y (paper, section 4).
 
     Args:
-        beyond_goal: as of `route`; the goal of an agent without a route stays.
+        goal_ends: as of `route`; the goal of an agent without a route stays.
     """
     motion, goal = state.motion, state.agents.goal
-    if beyond_goal and scene.routes.length.shape[0]:
+    if not goal_ends and scene.routes.length.shape[0]:
         end, _ = route_following.find_point(scene, state.agents.route, scene.routes.length[state.agents.route])
         goal = jnp.where(route_following.find_routed(scene, state.agents)[:, None], end, goal)
     goal = to_frame(goal - motion.position[:, :2], motion.yaw)
