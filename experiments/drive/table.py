@@ -139,6 +139,7 @@ def list_town_settings() -> tuple[str, ...]:
 
 
 def ask(row: Row, runs: tuple[str, ...], planner: str | None, scenes: str, given: argparse.Namespace) -> Asked:
+    """Asks for a row of runs, or of a planner, on a set of scenes."""
     towns = (*TOWNS, *(() if planner else list_town_settings())) if scenes == "null" else ()
     overrides = (*row.overrides, *(row.of_planners if planner else ()), *towns, *given.overrides)
     return Asked(runs, planner, row.protocol, overrides, None if scenes == "null" else scenes)
