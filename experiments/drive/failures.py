@@ -6,9 +6,7 @@ Kinds are those of `scenefactory_jax.evaluation.failures`, where each is defined
 words is read from `--kept`. Writes `failures.md`.
 """
 
-import argparse
 from collections import Counter
-from pathlib import Path
 
 import numpy as np
 
@@ -18,7 +16,6 @@ from scenefactory_jax.data.loading import scene_source
 from scenefactory_jax.evaluation.failures import FAILURE_TYPES
 from scenefactory_jax.evaluation.statistics import Runs
 
-HERE = Path(__file__).parent
 SPEEDS_MPS = (0.5, 2.0)
 SLOW = "of collisions: slower than {:g} m/s"
 
@@ -36,18 +33,11 @@ def count_kinds(runs: Runs) -> dict[str, str]:
 
 def main() -> None:
     """Reads the command line, evaluates what is not kept, and writes."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--runs", nargs="*", default=[], help="NAME=FOLDER,FOLDER...")
-    parser.add_argument("--scenes", nargs="+", required=True, help="NAME=PATH; PATH null: 64 towns that no training has seen")
-    parser.add_argument("--planners", nargs="*", choices=table.PLANNERS, default=[])
+    parser = table.make_parser(__doc__)
     parser.add_argument("--row", choices=list(table.ROWS), default="route100")
-    parser.add_argument("--overrides", nargs="*", default=[])
-    parser.add_argument("--kept", type=Path, default=Path("runs/table"))
-    parser.add_argument("--out", type=Path, default=HERE)
     given = parser.parse_args()
     scene_source.use_compilation_cache()
-    drivers = {planner: ((), planner) for planner in given.planners}
-    drivers |= {name: (tuple(folders), None) for name, folders in evaluations.parse_runs(given.runs).items()}
+    drivers = table.list_drivers(given)
     lines = [f"# First failures in `{given.row}`", "", "Of all agents; the runs of a name together."]
     for name, (scenes,) in evaluations.parse_runs(given.scenes).items():
         asked = {driver: table.ask(table.ROWS[given.row], *who, scenes, given) for driver, who in drivers.items()}

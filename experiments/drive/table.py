@@ -177,29 +177,40 @@ def format_estimate(estimate: Mapping[str, Any] | None, marks: Mapping[str, str]
     return show(estimate["value"]) + unit + interval + (marks[estimate["device"]] if marks else "")
 
 
-def main() -> None:
-    """Reads the command line, evaluates what is missing and writes the table after every row."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+def make_parser(about: str | None) -> argparse.ArgumentParser:
+    """Makes the arguments that say who drives and where: the same for every report of these evaluations."""
+    parser = argparse.ArgumentParser(description=about, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--runs", nargs="*", default=[], help="NAME=FOLDER,FOLDER...")
     parser.add_argument("--scenes", nargs="+", required=True, help="NAME=PATH; PATH null: 64 towns that no training has seen")
     parser.add_argument("--planners", nargs="*", choices=PLANNERS, default=[])
-    parser.add_argument("--rows", nargs="*", choices=list(ROWS), default=list(ROWS))
     parser.add_argument("--overrides", nargs="*", default=[])
-    parser.add_argument("--bootstrap", type=int, default=2000)
     parser.add_argument("--kept", type=Path, default=Path("runs/table"))
     parser.add_argument("--out", type=Path, default=HERE)
+    return parser
+
+
+def list_drivers(given: argparse.Namespace) -> dict[str, tuple[tuple[str, ...], str | None]]:
+    """Lists who drives, planners before runs: name -> folders of its runs, and the planner."""
+    runs = {name: (tuple(folders), None) for name, folders in evaluations.parse_runs(given.runs).items()}
+    return {planner: ((), planner) for planner in given.planners} | runs
+
+
+def main() -> None:
+    """Reads the command line, evaluates what is missing and writes the table after every row."""
+    parser = make_parser(__doc__)
+    parser.add_argument("--rows", nargs="*", choices=list(ROWS), default=list(ROWS))
+    parser.add_argument("--bootstrap", type=int, default=2000)
     given = parser.parse_args()
     scene_source.use_compilation_cache()
     given.out.mkdir(parents=True, exist_ok=True)
-    runs = {name: tuple(folders) for name, folders in evaluations.parse_runs(given.runs).items()}
-    drivers = {**{planner: ((), planner) for planner in given.planners}, **{name: (folders, None) for name, folders in runs.items()}}
+    drivers = list_drivers(given)
     rows = [] if given.rows == list(ROWS) else ["--rows", *given.rows]
     words = ["--runs", *given.runs, "--scenes", *given.scenes, "--planners", *given.planners, *rows]
     command = " ".join(["python -m experiments.drive.table", *words])
     path = given.out / "table.json"
     result: dict[str, Any] = result_file.read(path) if path.exists() else {"commands": [], "runs": {}, "sets": {}}
     result["commands"] += [command] if command not in result["commands"] else []
-    result["runs"] |= {name: len(folders) for name, folders in runs.items()}
+    result["runs"] |= {name: len(folders) for name, (folders, planner) in drivers.items() if planner is None}
     for name, (scenes,) in evaluations.parse_runs(given.scenes).items():
         for row_name in given.rows:
             for driver, (folders, planner) in drivers.items():
