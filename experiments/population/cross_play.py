@@ -126,7 +126,10 @@ def main() -> None:
         estimates = {background: statistics.summarise_runs(tables, **numbers) for background, tables in driven.items()}
         values = {background: {metric: found[metric]._asdict() for metric in SHOWN} for background, found in estimates.items()}
         rows[name] = {"values": values, "losses": compute_losses(found, given.reference, bootstrap=given.bootstrap)}
-    command = f"python -m experiments.population.cross_play --egos {' '.join(given.egos)} --scenes {given.scenes} --name {given.name}"
+    others = f" --conditioned {given.conditioned}" if given.conditioned else ""
+    others += f" --scenes {given.scenes}" if given.scenes else ""
+    others += f" --overrides {' '.join(given.overrides)}" if given.overrides else ""
+    command = f"python -m experiments.population.cross_play --egos {' '.join(given.egos)}{others} --name {given.name}"
     result = {"name": given.name, "reference": given.reference, "rows": rows, "command": command, "versions": run_config.versions()}
     result_file.write(given.out / f"cross_play-{given.name}.json", result, digits=5)
     print(write_report(result_file.read(given.out / f"cross_play-{given.name}.json"), given.out / f"cross_play-{given.name}.md"))

@@ -162,11 +162,10 @@ class Session:
 
 def _run(part: str, plan: Plan, session: Session) -> bool:
     """Runs one part in this process and returns whether all of it was done."""
-    only = session.config["only"]
+    chosen = plan.choose(session.config["only"])
     if part == "train":
-        trainings = [training for training in plan.trainings if only is None or training.variant in only]
-        return _run_tasks(trainings, functools.partial(_make_trainer, plan, session), session)
-    evaluations = [task for task in plan.evaluations if (only is None or task.training.variant in only) and _is_ready(task)]
+        return _run_tasks(chosen.trainings, functools.partial(_make_trainer, plan, session), session)
+    evaluations = [task for task in chosen.evaluations if _is_ready(task)]
     return _run_tasks(evaluations, functools.partial(_make_evaluation, session), session)
 
 

@@ -71,6 +71,13 @@ class Plan(NamedTuple):
     trainings: list[Training]
     evaluations: list[Evaluation]
 
+    def choose(self, only: Sequence[str] | None) -> "Plan":
+        """The part of some variants, with the baselines of these, and policies; None: all."""
+        if only is None:
+            return self
+        trainings = [training for training in self.trainings if training.variant in only]
+        return Plan(trainings, [evaluation for evaluation in self.evaluations if evaluation.training.variant in only])
+
 
 def make(config: Mapping[str, Any]) -> Plan:
     """Plans a study.

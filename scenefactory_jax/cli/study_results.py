@@ -119,17 +119,17 @@ def collect(plan: Plan, config: Mapping[str, Any], records: RowRecords) -> dict[
     """Collects the content of the report, as plain values.
 
     Returns:
-        study: its config; scenes: names of the sources; missing: what is not trained or evaluated yet; rows: one for each row, condition
-        and protocol; differences; drops: of conditions; trainings: variant -> durations, versions and curves.
+        study: its config; scenes: names of the sources; missing: what of `only` is not trained or evaluated yet; rows: one for each row,
+        condition and protocol; differences; drops: of conditions; trainings: variant -> durations, versions and curves.
     """
-    study, settings = config["study"], config["evaluation"]
+    study, settings, chosen = config["study"], config["evaluation"], plan.choose(config["only"])
     resampling = {"bootstrap": settings["bootstrap"], "seed": settings["seed"]}
     scenes = {name: config[name] and Path(config[name]).name for name in ("train_scenes", "test_scenes")}
     return {
         "study": {**study, "evaluation_overrides": study_plan.list_evaluation_overrides(config)},
         "settings": {name: config[name] for name in ("seeds", "common", "cut", "target", "evaluation")},
         "scenes": {name: scene or "the recipe's own" for name, scene in scenes.items()},
-        "missing": [task.label for task in (*plan.trainings, *plan.evaluations) if not task.file.is_file()],
+        "missing": [task.label for task in (*chosen.trainings, *chosen.evaluations) if not task.file.is_file()],
         "rows": [_summarise(key, runs, resampling) for key, runs in records.items() if runs],
         "differences": _choose(_compare(study["compare"], records, resampling), study["metrics"]),
         "drops": _choose(_compare_conditions(study["drops"], records, resampling), study["metrics"]),

@@ -398,6 +398,8 @@ def test_a_study_stops_at_its_time_limit_and_says_what_is_missing(tmp_path, caps
     result = study(toy(tmp_path, "time_limit_s=0.0"))
     assert "stopped at the time limit" in capsys.readouterr().out and not (tmp_path / "runs").exists()
     assert len(result["missing"]) == 4 + 9 and "**Not complete**: 13 " in (tmp_path / "out" / "navigation.md").read_text()
+    chosen = study(toy(tmp_path, "only=[one scene]", "parts=[report]"))["missing"]
+    assert set(chosen) < set(result["missing"]) and len(chosen) == 2 + 2 and all("one scene" in label for label in chosen)
 
 
 # ---- what is refused

@@ -16,11 +16,14 @@ RESULTS = ROOT / "experiments"
 COLUMNS = ("log", "route_pursuit", "idm_route", "pdm_closed", "ours")  # of the table of targets, in the order of the page's columns
 ROWS = {  # label -> set of scenes and line of the table of targets
     "64 scenes, `route100`: clean": ("womd_test", "`route100`: clean completion"),
+    "the same: collisions per 100 km": ("womd_test", "`route100`: collisions per 100 km"),
     "73 scenes with lights, `route100`: clean": ("womd_links_test", "`route100`: clean completion"),
+    "64 towns, `route100`: clean": ("towns", "`route100`: clean completion"),
     "recorded goals (`strict`): clean": ("womd_test", "`strict`: goal without any event"),
     "the same on bends": ("womd_test", "the same on bends"),
     "recorded goals among played-back traffic: clean": ("womd_test", "`strict` among played-back traffic: clean"),
     "the same: collisions": ("womd_test", "the same: collisions"),
+    "at-fault collisions in conflicts": ("womd_test", "`conflict`: at-fault collisions"),
     "V-Max's score": ("womd_test", "V-Max score"),
     "nuPlan's score": ("womd_test", "nuPlan score"),
 }
@@ -47,6 +50,14 @@ def test_the_published_task_is_as_in_navigation():
     found = {row["condition"]: row["pooled"]["success_rate"] for row in chosen}
     original, from_rest = (tables.format_estimate(statistics.Estimate(**found[name])) for name in ("original", "original, from rest"))
     assert f"{original} of the cars reach them and {from_rest} from rest" in SAID
+
+
+def test_the_published_configuration_is_as_in_its_study():
+    rows = result_file.read(RESULTS / "published" / "result.json")["rows"]
+    key = ("as published", "original, from rest", "goal_only")
+    (found,) = [row["pooled"] for row in rows if (row["row"], row["condition"], row["protocol"]) == key]
+    success, collide = (tables.format_estimate(statistics.Estimate(**found[name])) for name in ("success_rate", "collision_rate"))
+    assert f"brings {success} of the cars to them from rest, and {collide} collide" in SAID
 
 
 def test_intervals_and_looks_are_counted():
