@@ -70,7 +70,7 @@ def test_figures_of_the_readme_are_those_of_the_card():
 
 def test_the_readme_says_what_the_card_of_drive_does():
     card = (run_paths.SHIPPED / "drive" / "README.md").read_text()
-    lines = [line for line in card.splitlines() if line.startswith("| Driven") or ("protocol=route100)" in line and line.startswith("|"))]
+    lines = [line for line in card.splitlines() if line.startswith("| Driven") or ("(protocol=route100" in line and line.startswith("|"))]
     header, row = ([cell.strip() for cell in line.split("|")] for line in lines)
     said = " ".join((ROOT / "README.md").read_text().split())
     assert f"completes {row[header.index('Clean completion')]} of the routes of `route100` in new towns without any event" in said
