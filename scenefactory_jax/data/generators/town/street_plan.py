@@ -204,7 +204,17 @@ def grid(
                 if is_kept():
                     nodes.append(Node("outlet", _find_outlet(nodes[node].place, out, reach, MIN_STREET_M)))
                     edges.append(Edge(node, len(nodes) - 1, street))
+    for outlet in [edge for edge in edges if nodes[edge.b].kind == "outlet"]:  # two may cross outside of the square, where no junction is
+        if _overlaps(outlet, Plan(nodes, edges)):
+            edges = [edge for edge in edges if edge is not outlet]
     return _remove_dead_ends(Plan(nodes, edges), crossings[middle])
+
+
+def _overlaps(edge: Edge, plan: Plan) -> bool:
+    """Whether a street lies on one of a plan that shares no node with it."""
+    pave = lambda street: shapely.LineString(street.places(plan.nodes)).buffer(street.street.half_width())  # noqa: E731
+    others = [pave(other) for other in plan.edges if not {other.a, other.b} & {edge.a, edge.b}]
+    return bool(shapely.intersects(pave(edge), others).any())
 
 
 def _draw_lines(rng: np.random.Generator, reach: float, spacing: tuple[float, float], offset: float) -> list[float]:
