@@ -53,7 +53,8 @@ def export_car(settings: Mapping[str, Any], folder: Path) -> Path:
     car, zero = settings["dynamics"]["car"], np.zeros((1, 1))
     size = (car["length"], car["width"])
     scene = make_open_ground(np.zeros((1, 1, 2)), zero, zero, np.ones(1), np.zeros(1, np.int32), size=size)
-    return exported_world.write(folder / "car.xml", settings, jax.tree.map(lambda leaf: np.asarray(leaf)[0], scene), seed=0)
+    start = exported_world.make_sampler(settings)(jax.tree.map(lambda leaf: np.asarray(leaf)[0], scene), 0)
+    return exported_world.write(folder / "car.xml", settings, start)
 
 
 def load_script(world: Path) -> ModuleType:

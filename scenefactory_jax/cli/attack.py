@@ -1,6 +1,7 @@
 """`attack`: adversarial scenes. Vehicles of the traffic are made to collide with a planner's car, by the gradient of their actions."""
 
-from collections.abc import Mapping
+import re
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -15,6 +16,7 @@ from scenefactory_jax.cli.schema import Group, Protocol
 from scenefactory_jax.core import config as run_config
 from scenefactory_jax.core import schema
 from scenefactory_jax.core.instantiate import ConfigError, instantiate
+from scenefactory_jax.core.raw_scene import SceneError
 from scenefactory_jax.core.schema import Count, Seed
 from scenefactory_jax.core.trajectory import TrafficBoxes
 from scenefactory_jax.data.bank import bank_reader, bank_writer
@@ -73,7 +75,7 @@ def attack(config: Mapping[str, Any]) -> Attacked:
 
     Raises:
         ConfigError: a key that does not fit, neither or both of planner and run, or a protocol without scores.
-        SceneError: scenes that cannot be read.
+        SceneError: scenes that cannot be read, or whose present is another row of the log than the protocol's.
     """
     schema.check(config, AttackConfig)
     out, folder = _find_folders(config)
@@ -85,12 +87,13 @@ def attack(config: Mapping[str, Any]) -> Attacked:
     steps = round(episode_steps(ego["timing"]) / float(ego["timing"]["control_hz"]) / STEP_S)
     scenes = scene_source.load_all_scenes({**ego["scenes"], **config["scenes"]}, keep_raw=True)
     print(scenes.account, flush=True)
+    tasks.check_scenes(scenes)
     result = attacks.attack_scenes(
         scenes.scene, make_drive(ego, steps=steps), parameters, settings,
-        solvers={planner: make_drive(tasks.make_planner(planner), steps=steps) for planner in settings.solution.planners},
+        solvers={solver: make_drive(tasks.make_planner(solver), steps=steps) for solver in settings.solution.planners if solver != name},
         start_row=tasks.start_row, steps=steps, seed=config["seed"], worlds=config["worlds"],
     )  # fmt: skip
-    rows = attacks.make_table(result, scenes.scene, scenes.names, attacks.judge_worlds(result, None))
+    rows = attacks.make_table(result, scenes.scene, scenes.names, attacks.judge_worlds(result, None), start_row=tasks.start_row)
     touched = _replay(tasks, scenes, result, rows, settings, steps) if settings.contact.enable else None
     for row, verdict in zip(rows, attacks.judge_worlds(result, touched if settings.contact.required else None), strict=True):
         row["verdict"] = verdict
@@ -125,7 +128,7 @@ class Tasks:
         self.words = {name: [*words[name], *protocol.get("planner_overrides", {}).get(name, [])] for name in words}
         self.config, self.start_row = config, int(protocol["scores"]["past_rows"])
         self.termination = evaluation.load_terminations(protocol["termination"])[protocol["termination"][0]]
-        self.overrides = [*configs.list_overrides(protocol["settings"]), *config["overrides"]]
+        self.settings = configs.list_overrides(protocol["settings"])
         for where, names in {"planner": [config["planner"]], "solution.planners": config["solution"]["planners"]}.items():
             if unknown := [name for name in names if name is not None and name not in words]:
                 raise ConfigError(f"{where}: expected names of {', '.join(words)}, got {unknown[0]!r}")
@@ -134,20 +137,34 @@ class Tasks:
         if (config["planner"] is None) == (config["run"] is None):
             raise ConfigError(f"planner: expected a planner or run=RUN, one of them; got {config['planner']} and run={config['run']}")
 
+    def check_scenes(self, scenes: scene_source.Scenes) -> None:
+        """Raises SceneError if an episode of the protocol would not begin with the present of a scene, where its log is replaced."""
+        for raw in (report.raw for report in scenes.reports):
+            if raw is not None and raw.current != self.start_row:
+                expected = f"expected the present in row {self.start_row} of the log (protocol.scores.past_rows)"
+                raise SceneError(f"{raw.source}: {expected}, got row {raw.current}")
+
     def make_ego(self) -> tuple[dict[str, Any], Any]:
         """The config of the ego's environment, and the parameters of its policy."""
         if self.config["run"] is None:
             return self.make_planner(self.config["planner"]), {}
         run = run_paths.find(self.config["run"])
         trained = configs.read(run, trust=self.config["trust"])
-        task = configs.apply_overrides(trained, self.overrides)  # a policy drives the car that it knows
+        task = configs.apply_overrides(trained, [*_leave_car(self.settings), *self.config["overrides"]])
         return {**task, "termination": self.termination}, checkpoint.restore_parameters(run / "checkpoints")
 
     def make_planner(self, planner: str, *more: str, attacks: bool = True) -> dict[str, Any]:
-        """The config of an environment with a planner; `attacks`: with the dynamics of the search."""
-        quick = self.config["attack_overrides"] if attacks else []
-        base = configs.load_config("train", *evaluation.ALONE, "name=attack", *self.overrides, *quick)
+        """The config of an environment with a planner; `attacks`: with the dynamics of the search, else with the protocol's car."""
+        overrides = self.config["overrides"]
+        given = [*overrides, *self.config["attack_overrides"]] if attacks else _leave_car(overrides)
+        base = configs.load_config("train", *evaluation.ALONE, "name=attack", *self.settings, *given)
         return {**configs.apply_overrides(base, [*self.words[planner], *more]), "termination": self.termination}
+
+
+def _leave_car(overrides: Sequence[str]) -> list[str]:
+    """Overrides without those that choose a car, its time steps or its controls; the length of an episode is none of these."""
+    groups = ("timing", "dynamics", "actions")
+    return [word for word in overrides if word.startswith("timing.episode_s=") or re.split("[.=]", word.lstrip("+~"))[0] not in groups]
 
 
 def _replay(
@@ -161,7 +178,7 @@ def _replay(
     task = tasks.make_planner("expert", "observations.log.start_row=0", "traffic=none", attacks=False)
     pairs, size = _take_pairs(scenes, result, hit)
     worlds = jax.tree.map(lambda leaf: np.asarray(leaf)[hit], scenes.scene)
-    replays = contact_replay.replay_pairs(task, worlds, pairs, size, seconds=steps * STEP_S)
+    replays = contact_replay.replay_pairs(task, worlds, pairs, size, seconds=steps * STEP_S, worlds=tasks.config["worlds"])
     for number, world in enumerate(hit.tolist()):
         expected, row = rows[world]["collision_s"], rows[world]
         for engine, found in zip(("articulated", "c_engine"), replays, strict=True):

@@ -94,7 +94,7 @@ def _load_task(config: Mapping[str, Any]) -> tuple[dict[str, Any], Path | None, 
     protocol, run = config["protocol"], None
     settings = configs.list_overrides(protocol["settings"])
     if config["run"] is None:
-        known, name = configs.load_config("evaluate", "run=null")["planner_overrides"], config["planner"]
+        known, name = configs.load_config("evaluate", "run=null", f"protocol={protocol['name']}")["planner_overrides"], config["planner"]
         if name not in known:
             raise ConfigError(f"planner: expected one of {', '.join(known)}, got {name!r}")
         trained, home = configs.load_config("train", *ALONE, f"name={name}", *settings), Path("runs") / name

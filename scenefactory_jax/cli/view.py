@@ -77,7 +77,8 @@ def replay(config: Mapping[str, Any]) -> Path:
     out.parent.mkdir(parents=True, exist_ok=True)
     if out.suffix == ".xml":
         scene = jax.tree.map(lambda leaf: leaf[0], shown.scene)
-        return exported_world.write(out, {**settings, "dynamics": dynamics}, scene, seed=command.seed)
+        settings = {**settings, "dynamics": dynamics}
+        return exported_world.write(out, settings, exported_world.make_sampler(settings)(scene, command.seed))
     policy = recorded_episodes.select_policy(settings, run=command.run, act=command.act, slots=shown.scene.agents.yaw.shape[1])
     recording = recorded_episodes.record_episodes(settings, shown.scene, policy, seconds=command.seconds, seed=command.seed)
     if out.suffix in film.SUFFIXES:

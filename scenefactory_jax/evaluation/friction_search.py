@@ -67,7 +67,8 @@ class Way(NamedTuple):
 class Outcome(NamedTuple):
     """What came of driven candidates, [W, C]."""
 
-    failed: Bool[np.ndarray, "W C"]
+    happened: Bool[np.ndarray, "W C"]  # an event of FAILURE_EVENTS
+    failed: Bool[np.ndarray, "W C"]  # the first one is of `search.failures`
     event: Int[np.ndarray, "W C"]  # the first one, an index into FAILURE_EVENTS; valid where an event happened
     step: Int[np.ndarray, "W C"]  # control step of the first event
     speed: Float[np.ndarray, "W C"]  # m/s before it
@@ -94,7 +95,7 @@ class Found(NamedTuple):
 
 
 class SearchResult(NamedTuple):
-    """All that were found, worlds in which the agent fails on the dry road, and the numbers of drives and rounds."""
+    """All that were found, worlds that are left out because an event happens on the dry road, and the numbers of drives and rounds."""
 
     found: list[Found]
     fails_dry: list[int]
@@ -131,7 +132,7 @@ def make_driver(
         failed = signals.has_failed & kinds[signals.first_event] & ((signals.first_event != collision) | hits)
         begin = state.motion.position[None, EGO, :2], state.motion.yaw[None, EGO]
         position, yaw = (jnp.concatenate([first, leaf[:, EGO]]) for first, leaf in zip(begin, (frames.position, frames.yaw), strict=True))
-        return failed, signals.first_event, signals.first.step, signals.speed, position, yaw
+        return signals.has_failed, failed, signals.first_event, signals.first.step, signals.speed, position, yaw
 
     candidates = jax.vmap(drive, in_axes=(None, None, None, 0))
     drive_all = jax.jit(jax.vmap(candidates, in_axes=(None, 0, 0, 0)))
@@ -199,7 +200,7 @@ def search(
     nothing = np.zeros((worlds, places))
     at_start = Way(*(np.asarray(leaf)[:, None] for leaf in (scene.agents.position[:, EGO], scene.agents.yaw[:, EGO])))
     dry = attempt(at_start, next(iter(settings.covers.values())), nothing, nothing, nothing)
-    way, fails_dry = Way(dry.position[:, 0], dry.yaw[:, 0]), dry.failed[:, 0]
+    way, fails_dry = Way(dry.position[:, 0], dry.yaw[:, 0]), dry.happened[:, 0]
     length = np.linalg.norm(np.diff(way.position, axis=1), axis=-1).sum(axis=1)
     begin = length[:, None] * np.arange(places) / places
     found: list[Found] = []

@@ -456,8 +456,8 @@ def steps_of(config):
 
 TIMED = {"vmax": "vmax", "plants": "vmax", "scenarionet": "scenarionet", "curriculum": "scenarionet"}  # study -> its protocol
 TIMED |= {"learners": "route100", "drive_rewards": "route100", "drive_collisions": "route100", "vmax_scenes": "vmax"}
-STREAMED = "recipe_drive"  # trains on a mixture of banks and generated scenes
-WHOLE = [name for name in STUDIES if name not in (*TIMED, STREAMED)]
+STREAMED, ADVERSARIES = "recipe_drive", "adversaries"  # train on a mixture of banks and generated scenes, or of banks
+WHOLE = [name for name in STUDIES if name not in (*TIMED, STREAMED, ADVERSARIES)]
 TWINS = {"rewards_laptop", "network_laptop"}  # nearly the same variants as another study, for a CPU
 LONG = {*TWINS, "floors", "friction", "recipe", "rewards"}  # many environments each
 
@@ -525,6 +525,20 @@ def test_a_study_of_a_mixture_is_whole(tmp_path):
         assert built["scenes"]["pack"]["starts"]["mu"] == built["weather"]["friction"]["surfaces"]["ICE"]["mu"] == 0.15
     for one in {one.program: one for one in plan.trainings}.values():
         environment.make_parts(one.config)
+
+
+def test_a_study_of_adversaries_meets_them(tmp_path):
+    """Only the recording car is an agent, everybody else is as recorded and in time with it, and the rows differ by their scenes alone."""
+    words = ["banks.adversarial=found.bank", "test_scenes=test.bank", "common=[start_from=drive]", "seeds=[0]"]
+    plan = study_plan.make(hydra_config.load_config("study", f"study={ADVERSARIES}", f"runs={tmp_path}", *words))
+    plain, both = (one.config for one in plan.trainings)
+    assert both["stream"]["shares"]["womd_links"] > 0 and plain["stream"]["shares"] == {"womd": 1.0, "womd_links": None, "generator": None}
+    assert both["stream"]["banks"]["womd_links"] == "found.bank" and {**both, "stream": plain["stream"], "name": plain["name"]} == plain
+    assert both["scenes"]["pack"]["agents"] == 1 and both["traffic"]["members"] == ["log"]
+    starts = [name for name, part in both["spawning"]["sampler"]["parts"].items() if part]
+    assert both["spawning"]["respawn_clearance_m"] is None and starts == ["recorded"]
+    environment.make_parts(both)
+    assert {one.row for one in plan.evaluations} == {"before", "plain scenes", "adversarial scenes, too"}
 
 
 def test_protocols_are_the_conditions_of_the_readmes_rows(tmp_path):

@@ -77,7 +77,7 @@ def test_a_plane_is_exact_where_the_map_is_and_beyond():
     assert scene.road.height is None
     np.testing.assert_allclose(grades[0], [0.6, 0.6, 0.6, -0.2], atol=1e-3)
     with pytest.raises(ConfigError, match=r"^scenes\.pack\.elevation: an exported world is flat; expected null"):
-        exported_world.sample_start({}, scene, seed=0)
+        exported_world.make_sampler(load_config("train", "experiment=smoke", "dynamics=articulated"))(scene, 0)
 
 
 def test_levels_are_told_apart_by_height_and_by_the_lanes_direction(crossing):

@@ -13,6 +13,7 @@ from support.scene_banks import banked
 from experiments.adversaries import table
 from scenefactory_jax.cli import hydra_config
 from scenefactory_jax.cli.attack import PARTS, Tasks, attack
+from scenefactory_jax.core import config as run_config
 from scenefactory_jax.core import schema
 from scenefactory_jax.core.boxes import find_overlaps
 from scenefactory_jax.core.pytree import unchecked
@@ -141,6 +142,22 @@ def test_a_contact_from_behind_is_none_of_the_ego(loaded):
     behind, beside = look(0.0), look(NORTH)
     assert bool(behind.touched[row]) and not bool(behind.found)
     assert bool(beside.found) and int(beside.row) == row and bool(beside.other_at_fault) and not bool(beside.ego_at_fault)
+
+
+def test_a_run_keeps_its_own_car(bank, tmp_path, monkeypatch):
+    """With its time steps and its controls; the replay that confirms a contact always has the protocol's."""
+    monkeypatch.setattr("scenefactory_jax.learning.checkpoint.restore_parameters", lambda folder: {})
+    run_config.write(tmp_path, hydra_config.load_config("train", "experiment=vmax", "dynamics=bicycle"))
+    given = {**asked(bank.path, "x"), "planner": None, "run": str(tmp_path)}
+    ego, parameters = Tasks({**given, "overrides": ["weather=wet"]}).make_ego()
+    assert ego["dynamics"]["_target_"].endswith("bicycle.make") and parameters == {}
+    assert (ego["timing"]["control_hz"], ego["timing"]["episode_s"]) == (10, 8)
+    assert ego["traffic"]["start_row"] == 10 and ego["scenes"]["pack"]["agents"] == 1
+    tasks = Tasks({**given, "overrides": ["dynamics=bicycle_lagged", "weather=wet"]})
+    replay = tasks.make_planner("expert", attacks=False)
+    assert tasks.make_ego()[0]["dynamics"]["acceleration_lag_s"] == 0.2
+    assert replay["dynamics"]["_target_"].endswith("articulated_car.make") and replay["timing"]["control_hz"] == 30
+    assert replay["weather"] == ego["weather"]
 
 
 def test_errors_name_the_key(bank, tmp_path):

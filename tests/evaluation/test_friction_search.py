@@ -129,7 +129,7 @@ def fake_driver(config, settings, **_):
         along = np.stack([np.cos(yaw), np.sin(yaw)], axis=-1) * np.linspace(0.0, 40.0, 21)[:, None]
         position = np.asarray(scene.agents.position)[:, :1, None] + along
         kind = np.full(shape, FAILURE_EVENTS.index("road_edge_contact"))
-        return Outcome(failed, kind, np.full(shape, 12), np.full(shape, 7.0), position, yaw)
+        return Outcome(failed, failed, kind, np.full(shape, 12), np.full(shape, 7.0), position, yaw)
 
     return drive
 
@@ -141,7 +141,7 @@ def test_the_command_writes_scenes_that_keep_their_slicks(bank, tmp_path, monkey
     assert {(one.world, one.cover) for one in found.result.found} == {(w, c) for w in (1, 2) for c in ("ice", "water")}
     assert all(10.0 <= one.extent_m < 14.0 and one.film_mm in (0.0, 0.25) for one in found.result.found)  # any film fails
     text = found.report.read_text()
-    assert "2 of the 3 scenes without a failure on the dry road" in text and text.count("road edge contact") == 4
+    assert "2 of the 3 scenes without an event on the dry road" in text and text.count("road edge contact") == 4
     assert (tmp_path / "out" / "found.png").stat().st_size > 5000 and len((tmp_path / "out" / "found.csv").read_text().splitlines()) == 5
     written = bank_reader.open(tmp_path / "out" / "bank")
     assert [name.rsplit("-", 1)[1] for name in written.names] == ["ice", "ice", "water", "water"]
@@ -190,6 +190,11 @@ def report_of(name, metadata):
 def test_wrong_keys_are_named(words, message):
     with pytest.raises(ConfigError, match=message):
         search_friction.search_friction(hydra_config.load_config("search_friction", *words))
+
+
+def test_a_planner_that_follows_the_log_is_in_time_with_the_traffic():
+    task, *_ = search_friction._load_task(load_config("search_friction", "planner=expert"))
+    assert task["observations"]["log"]["start_row"] == task["traffic"]["start_row"] == 10
 
 
 def test_a_stream_that_would_leave_the_patches_out_is_refused():

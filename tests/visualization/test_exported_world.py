@@ -40,7 +40,8 @@ def settings(*overrides):
 
 
 def export(folder, scene, *overrides):
-    return exported_world.write(Path(folder) / "world.xml", settings(*overrides), scene, seed=0)
+    entry = settings(*overrides)
+    return exported_world.write(Path(folder) / "world.xml", entry, exported_world.make_sampler(entry)(scene, 0))
 
 
 def scene_with(*starts):
@@ -155,7 +156,7 @@ def test_a_world_with_patches_and_cars_that_differ_drives_like_the_environment(t
     config = settings("weather=split", "dynamics/randomization=spread")
     scene = scene_with((-40, 1, 0, 12), (-10, -2, 0.1, 8), (20, 0, 2.5, 5))
     env, actions = environment.make_env(config), jnp.array([[0.6, 0.2, 0.0], [0.0, -0.1, 0.8], [0.3, 0.3, 0.0]], jnp.float32)
-    key = jax.random.split(jax.random.split(jax.random.key(0), 1)[0])[1]  # as `sample_start`
+    key = jax.random.split(jax.random.split(jax.random.key(0), 1)[0])[1]  # as `make_sampler`
 
     @jax.jit
     def run(key):
@@ -206,7 +207,7 @@ def test_a_car_hits_a_traffic_object(tmp_path):
     f = lambda *rows: jnp.array(rows, jnp.float32)  # noqa: E731
     still = f([0, 0])
     boxes = Boxes(f([12, 0]), f(0.7), f(0.0), still, f(0), f([4, 2]), f(np.inf), jnp.array([True]))
-    start = exported_world.sample_start(settings(DRY), scene_with((0, 0, 0, 6)), seed=0)
+    start = exported_world.make_sampler(settings(DRY))(scene_with((0, 0, 0, 6)), 0)
     model = world_mjcf.build(start._replace(scene=replace(start.scene, traffic=boxes)), *BUILT, **SIZES).compile()
     data, cars = mujoco.MjData(model), mujoco_car.find_cars(model)
     mujoco.mj_resetDataKeyframe(model, data, 0)
@@ -236,7 +237,7 @@ def test_the_restitution_of_contacts_is_that_of_the_law():
 
 
 def test_a_world_holds_the_start_of_the_episode(tmp_path):
-    start = exported_world.sample_start(settings(ICE), scene_with((3, -1, 0.5, 7), (20, 5, -2, 0)), seed=0)
+    start = exported_world.make_sampler(settings(ICE))(scene_with((3, -1, 0.5, 7), (20, 5, -2, 0)), 0)
     world = export(tmp_path, scene_with((3, -1, 0.5, 7), (20, 5, -2, 0)), ICE)
     model = mujoco.MjModel.from_xml_path(str(world))
     data = mujoco.MjData(model)
@@ -265,13 +266,13 @@ def test_cars_that_differ_keep_their_parameters_and_boxes(tmp_path):
 def test_without_cars_the_error_says_so():
     scene = scene_with((0, 0, 0, 5))
     with pytest.raises(ConfigError, match="no car starts"):
-        exported_world.sample_start(settings(), replace(scene, agents=replace(scene.agents, present=jnp.zeros(1, bool))), seed=0)
+        exported_world.make_sampler(settings())(replace(scene, agents=replace(scene.agents, present=jnp.zeros(1, bool))), 0)
 
 
 @pytest.mark.slow
 def test_patches_change_the_friction_under_each_wheel(tmp_path):
     config, scene = settings("weather=split"), scene_with((0, 0, 0, 8))
-    start = exported_world.sample_start(config, scene, seed=0)
+    start = exported_world.make_sampler(config)(scene, 0)
     world = export(tmp_path, scene, "weather=split")
     drive, model, data, cars = opened(world)
     compute_mu = jax.jit(friction.make(config["weather"]["friction"]))

@@ -42,7 +42,7 @@ def make_scene(report: PackReport, attack: Attack, *, ego: str, solvers: Iterabl
 
 
 def replace_track(track: Track, attack: Attack, slot: int, *, start: int, centre: np.ndarray) -> Track:
-    """Replaces the states of a track from the start on; heights stay, and are held where the log has none."""
+    """Replaces the states of a track from the start on, and ends it with the attack; heights stay, and are held where the log has none."""
     count = min(attack.track.yaw.shape[1], len(track.valid) - start)
     rows = slice(start, start + count)
     present = np.asarray(attack.chosen.present[slot, :count])
@@ -54,4 +54,5 @@ def replace_track(track: Track, attack: Attack, slot: int, *, start: int, centre
     yaw[rows] = np.where(present, np.asarray(attack.track.yaw[slot, :count], float), 0.0)
     velocity[rows] = np.where(present[:, None], np.asarray(attack.track.velocity[slot, :count], float), 0.0)
     valid[rows] = present
+    valid[start + count :] = False  # else it jumps back to its log
     return replace(track, xyz=xyz, yaw=yaw, velocity=velocity, valid=valid)

@@ -1,19 +1,21 @@
 """Attacks all scenes, block by block, checks that the collisions can be avoided, and says what is kept and why the rest is dropped."""
 
 import functools
-import time
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 import jax
 import numpy as np
 from jaxtyping import Bool
 
+from scenefactory_jax.core.blocks import Blocks
 from scenefactory_jax.core.pytree import replace
 from scenefactory_jax.core.raw_scene import SceneError
 from scenefactory_jax.core.types import Scene
 from scenefactory_jax.evaluation.adversary import ego_drive, search, solution
 from scenefactory_jax.evaluation.adversary.ego_drive import DriveEgo
+from scenefactory_jax.evaluation.adversary.eligibility import Adversaries
+from scenefactory_jax.evaluation.adversary.kinematics import Track
 from scenefactory_jax.evaluation.adversary.search import Attack
 from scenefactory_jax.evaluation.adversary.settings import AttackSettings
 from scenefactory_jax.evaluation.scoring import EVEN_S, STEP_S
@@ -74,39 +76,17 @@ def attack_scenes(
         raise SceneError(f"scenes: expected logs of {start_row + steps + 1} steps for an attack, got {rows}")
     keys = jax.random.split(jax.random.key(seed), count)
     attack_one = functools.partial(search.attack_world, drive, start_row=start_row, steps=steps, settings=settings)
-    attack = _Blocks(lambda parameters, scene, key: attack_one(parameters, scene, key), worlds)
+    attack = Blocks(lambda parameters, scene, key: attack_one(parameters, scene, key), worlds)
     found = attack.run(parameters, replace(scene, road_grid=None), keys)
     solved = {}
     for name, planner in solvers.items():
         solve = functools.partial(solution.solve_by_planner, planner, start_row=start_row)
-        check = _Blocks(lambda parameters, scene, found, key, solve=solve: solve({}, scene, found, key), worlds)
+        check = Blocks(lambda parameters, scene, found, key, solve=solve: solve({}, scene, found, key), worlds)
         solved[name] = np.asarray(check.run(None, replace(scene, road_grid=None), found, keys).solved)
     if settings.solution.gradient:
-        check = _Blocks(lambda parameters, scene, found: solution.solve_by_gradient(scene, found, settings), worlds)
+        check = Blocks(lambda parameters, scene, found: solution.solve_by_gradient(scene, found, settings), worlds)
         solved[GRADIENT] = np.asarray(check.run(None, replace(scene, road_grid=None), found).solved)
     return Result(found, solved, attack.seconds / count)
-
-
-class _Blocks:
-    """A function (parameters, operands of one world), compiled once and run for blocks of worlds."""
-
-    def __init__(self, function: Callable[..., Any], worlds: int):
-        self.function, self.worlds, self.seconds = function, worlds, 0.0
-
-    def run(self, parameters: Any, *operands: Any) -> Any:
-        """Runs the function for all worlds; the last block repeats the last world."""
-        count = len(jax.tree.leaves(operands)[0])
-        size = min(self.worlds, count)
-        axes = (None, *(0 for _ in operands))
-        compiled, results = None, []
-        for start in range(0, count, size):
-            rows = np.minimum(np.arange(start, start + size), count - 1)
-            block = jax.tree.map(lambda leaf, rows=rows: leaf[rows], operands)
-            compiled = compiled or jax.jit(jax.vmap(self.function, in_axes=axes)).lower(parameters, *block).compile()
-            begin = time.monotonic()
-            results.append(jax.device_get(compiled(parameters, *block)))
-            self.seconds += time.monotonic() - begin
-        return jax.tree.map(lambda *leaves: np.concatenate(leaves)[:count], *results)
 
 
 def find_hits(result: Result) -> Bool[np.ndarray, " W"]:
@@ -136,10 +116,12 @@ def judge_worlds(result: Result, touched: Bool[np.ndarray, " W"] | None) -> list
     return [next((name for name, mask in dropped.items() if mask[world]), KEPT) for world in range(len(solved))]
 
 
-def make_table(result: Result, scene: Scene, names: tuple[str, ...], verdicts: list[str]) -> list[dict[str, Any]]:
+def make_table(
+    result: Result, scene: Scene, names: tuple[str, ...], verdicts: list[str], *, start_row: int
+) -> list[dict[str, Any]]:
     """Lists a row for every world."""
     attack, contact = result.attack, result.attack.outcome.contact
-    off_road, logged_off_road = (np.asarray(part) for part in _find_off_road(scene, attack))
+    off_road, logged_off_road = (np.asarray(part) for part in _find_off_road(scene, attack, start_row=start_row))
     hits, rows = find_hits(result), []
     for world, name in enumerate(names):
         hit = bool(hits[world])
@@ -159,17 +141,20 @@ def make_table(result: Result, scene: Scene, names: tuple[str, ...], verdicts: l
     return rows
 
 
-def _find_off_road(scene: Scene, attack: Attack) -> tuple[Any, Any]:
+def _find_off_road(scene: Scene, attack: Attack, *, start_row: int) -> tuple[Any, Any]:
     """Whether an adversary of each world is beyond a road edge at any time (Waymax), attacked and as logged."""
 
     @jax.jit
-    def find(scene: Scene, chosen: Any, *tracks: Any) -> Any:
+    def find(scene: Scene, chosen: Adversaries, track: Track) -> Any:
         def find_world(world: tuple) -> Any:
-            scene, chosen, tracks = world
-            there = chosen.present & chosen.eligible[:, None]
+            scene, chosen, track = world
+            log, rows = scene.traffic_log, slice(start_row, start_row + track.yaw.shape[-1])
+            logged = Track(*(leaf[chosen.row, rows] for leaf in (log.position, log.yaw, log.velocity)))
             find_one = lambda track: jax.vmap(functools.partial(ego_drive.find_off_road, scene))(track.position, track.yaw, chosen.size)  # noqa: E731
-            return tuple((find_one(track) & there).any() for track in tracks)
+            there = chosen.eligible[:, None]
+            valid = chosen.present & log.valid[chosen.row, rows]
+            return (find_one(track) & there & chosen.present).any(), (find_one(logged) & there & valid).any()
 
-        return jax.lax.map(find_world, (scene, chosen, tracks))
+        return jax.lax.map(find_world, (scene, chosen, track))
 
-    return jax.device_get(find(replace(scene, road_grid=None), attack.chosen, attack.track, attack.chosen.followed))
+    return jax.device_get(find(replace(scene, road_grid=None), attack.chosen, attack.track))

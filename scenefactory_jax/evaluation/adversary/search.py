@@ -26,7 +26,7 @@ class Outcome(NamedTuple):
 
     contact: Contact
     hit: Bool[Array, ""]  # the first contact is with an adversary
-    deep: Bool[Array, ""]  # the ego and an adversary overlap by `contact_depth_m` at some time
+    deep: Bool[Array, ""]  # the ego and this adversary overlap by `contact_depth_m` at some time
     off_road: Bool[Array, ""]  # an adversary is off the road, farther than its log
     overlaps: Bool[Array, ""]  # an adversary overlaps another road user, which its log does not
     success: Bool[Array, ""]  # hit, deep, and neither of the others
@@ -235,7 +235,7 @@ def judge(scene: Scene, driven: Drive, track: Track, problem: Problem, settings:
     overlaps = jnp.any(find_overlapping(track, driven.traffic, problem) & ~find_overlapping(chosen.followed, driven.traffic, problem))
     smaller = scene.agents.size[EGO] - 2.0 * settings.search.contact_depth_m
     deep = find_overlaps(driven.ego.position, driven.ego.yaw, smaller, track.position, track.yaw, chosen.size[:, None])
-    deep = jnp.any(deep & there)
+    deep = jnp.any(deep & there & (chosen.row == contact.row)[:, None])
     success = hit & deep & ~off_road & ~overlaps
     return Outcome(contact, hit, deep, off_road, overlaps, success)
 

@@ -42,8 +42,8 @@ def solve_by_planner(
 def solve_by_gradient(scene: Scene, attack: Attack, settings: AttackSettings) -> Solution:
     """Optimises the actions of the ego's drive among the adversaries by the costs of `search.compute_upkeep`.
 
-    Solved: it touches nothing and stays on the road, as far as its drive did. The ego knows what will happen; so this says that a way
-    exists, not that a driver would find it.
+    Solved: it touches nothing and is never farther off the road than its drive was before the contact. The ego knows what will happen; so
+    this says that a way exists, not that a driver would find it.
     """
     solution = settings.solution
     weights = dataclasses.replace(settings.costs, repulsion=solution.repulsion)
@@ -52,15 +52,19 @@ def solve_by_gradient(scene: Scene, attack: Attack, settings: AttackSettings) ->
     boxes: Boxes = jax.tree.map(lambda leaf: jnp.swapaxes(leaf, 0, 1), attack.drive.traffic)
     around = Track(boxes.position, boxes.yaw, boxes.velocity), boxes.present, boxes.size[:, 0]
     problem = search.make_problem(scene, ego, *around, settings)
-    problem = problem._replace(margin=jnp.full_like(problem.margin, solution.margin_m))
+    find_outside = lambda track: costs.compute_outside(  # noqa: E731
+        track.position, track.yaw, ego.size[:, None], problem.road, half_lane_m=weights.half_lane_m
+    )
+    before = jnp.arange(ego.followed.yaw.shape[1])[:, None] < attack.outcome.contact.step  # which may push the ego off the road
+    allowed = jnp.max(jnp.where(before, find_outside(ego.followed), 0.0), axis=(1, 2))
+    problem = problem._replace(margin=jnp.full_like(problem.margin, solution.margin_m), allowed=allowed)
     optimizer = search.make_optimizer(settings, ego.steers)
     loss = lambda change: search.compute_upkeep(change, search.move(change, problem, settings), problem, settings)  # noqa: E731
     change = jnp.zeros_like(ego.actions)
     change, _ = search.descend(loss, change, optimizer.init(change), optimizer, iterations=solution.iterations, settings=settings)
     track = search.move(change, problem, settings)
     touches = jnp.any(search.find_overlapping(track, attack.drive.traffic, problem))
-    outside = costs.compute_outside(track.position, track.yaw, ego.size[:, None], problem.road, half_lane_m=weights.half_lane_m)
-    leaves_road = jnp.any(jnp.max(outside, axis=-1) > problem.allowed[:, None] + search.OFF_ROAD_M)
+    leaves_road = jnp.any(jnp.max(find_outside(track), axis=-1) > problem.allowed[:, None] + search.OFF_ROAD_M)
     return Solution(jax.tree.map(lambda leaf: leaf[0], track), ~touches & ~leaves_road)
 
 

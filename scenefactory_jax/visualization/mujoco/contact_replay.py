@@ -14,6 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from scenefactory_jax.core.blocks import Blocks
 from scenefactory_jax.core.geometry import dot, heading_vector
 from scenefactory_jax.core.pytree import replace
 from scenefactory_jax.core.types import AgentLog, Agents, Scene
@@ -24,6 +25,7 @@ from scenefactory_jax.env.rollout import ControlStep, rollout, start_rollout
 from scenefactory_jax.evaluation.adversary.kinematics import Track
 from scenefactory_jax.learning.training_loop import make_policy
 from scenefactory_jax.visualization.mujoco import exported_world
+from scenefactory_jax.visualization.mujoco.exported_world import SampleStart
 
 PAIR = 2
 
@@ -35,7 +37,9 @@ class Replays(NamedTuple):
     c_engine_s: Float[np.ndarray, " N"]
 
 
-def replay_pairs(settings: Mapping[str, Any], scene: Scene, tracks: Track, size: Float[np.ndarray, "N 2 2"], *, seconds: float) -> Replays:
+def replay_pairs(
+    settings: Mapping[str, Any], scene: Scene, tracks: Track, size: Float[np.ndarray, "N 2 2"], *, seconds: float, worlds: int
+) -> Replays:
     """Replays a pair of trajectories for each world.
 
     Args:
@@ -44,12 +48,14 @@ def replay_pairs(settings: Mapping[str, Any], scene: Scene, tracks: Track, size:
         tracks: of ego and adversary, [N, 2, T], at the time steps of the log.
         size: length and width of both.
         seconds: of a replay.
+        worlds: replayed at once.
     """
     control_hz = float(settings["timing"]["control_hz"])
     pairs = jax.vmap(make_pair)(replace(scene, road_grid=None), Track(*map(jnp.asarray, tracks)), jnp.asarray(size, jnp.float32))
-    contact, actions = jax.device_get(_drive(settings, pairs, steps=round(seconds * control_hz)))
+    contact, actions = _drive(settings, pairs, steps=round(seconds * control_hz), worlds=worlds)
+    sample = exported_world.make_sampler(settings)
     with tempfile.TemporaryDirectory() as folder:
-        steps = [_replay_in_c(settings, pairs, actions, number, Path(folder)) for number in range(len(size))]
+        steps = [_replay_in_c(settings, sample, pairs, actions, number, Path(folder)) for number in range(len(size))]
     find = lambda touches: (np.argmax(touches) + 1) / control_hz if touches.any() else np.nan  # noqa: E731
     return Replays(np.array([find(touches) for touches in contact]), np.array([find(touches) for touches in steps]))
 
@@ -73,7 +79,7 @@ def make_pair(scene: Scene, tracks: Track, size: Float[Array, "2 2"]) -> Scene:
     return replace(scene, agents=agents, log=AgentLog(*tracks, jnp.ones(tracks.yaw.shape, bool), scene.log.dt))
 
 
-def _drive(settings: Mapping[str, Any], pairs: Scene, *, steps: int) -> tuple[Array, Array]:
+def _drive(settings: Mapping[str, Any], pairs: Scene, *, steps: int, worlds: int) -> tuple[np.ndarray, np.ndarray]:
     """Whether the two cars touch, [N, T], and their controls, [N, T, 2, 3]."""
     env, policy = environment.make_env(settings), make_policy(settings)
     act = lambda parameters, observation, key: policy.apply(parameters, observation)[0]  # noqa: E731
@@ -85,18 +91,19 @@ def _drive(settings: Mapping[str, Any], pairs: Scene, *, steps: int) -> tuple[Ar
         state = env.init_state(key, scene)
         return rollout(env, act, {}, scene, start_rollout(state, None), key, steps=steps, hook=hook)[1]
 
-    return jax.jit(jax.vmap(drive))(pairs, jax.random.split(jax.random.key(0), len(pairs.agents.yaw)))
+    keys = jax.random.split(jax.random.key(0), len(pairs.agents.yaw))
+    return Blocks(lambda _, *world: drive(*world), worlds).run(None, pairs, keys)
 
 
 def _replay_in_c(
-    settings: Mapping[str, Any], pairs: Scene, actions: Float[np.ndarray, "N T 2 3"], number: int, folder: Path
+    settings: Mapping[str, Any], sample: SampleStart, pairs: Scene, actions: Float[np.ndarray, "N T 2 3"], number: int, folder: Path
 ) -> np.ndarray:
     """Whether the boxes of the two cars touch in each control step of the exported world; the ground is open."""
     agents: Any = jax.tree.map(lambda leaf: np.asarray(leaf)[number : number + 1], pairs.agents)
     one = np.ones(1, np.float32)
     ground = make_open_ground(agents.position, agents.yaw, agents.speed, one, np.zeros(1, np.int32), size=(1.0, 1.0))
     ground = replace(jax.tree.map(lambda leaf: np.asarray(leaf)[0], ground), agents=jax.tree.map(lambda leaf: leaf[0], agents))
-    world = exported_world.write(folder / f"pair{number}.xml", settings, ground, seed=0)
+    world = exported_world.write(folder / f"pair{number}.xml", settings, sample(ground, 0))
     model, data, cars = mujoco_car.open_world(str(world))
     boxes = {model.geom(f"agent{slot}/box").id for slot in range(PAIR)}
     substeps, limit = round(settings["timing"]["physics_hz"] / settings["timing"]["control_hz"]), cars.car.steering_limit[0]

@@ -23,6 +23,7 @@ from scenefactory_jax.visualization.mujoco.world_mjcf import WorldStart
 from scenefactory_jax.weather import friction
 
 SCRIPT = "drive.py"
+SampleStart = Callable[[Scene, int], WorldStart]
 COMMENT = """
 {name}: a world of scenefactory_jax at the start of an episode (keyframe `start`).
 
@@ -46,18 +47,16 @@ boxes trafficN, which stand fixed.
 """
 
 
-def sample_start(settings: Mapping[str, Any], scene: Scene, *, seed: int) -> WorldStart:
-    """Samples starts, weather and cars as the first episode of `view` has them, and the traffic of that time.
+def make_sampler(settings: Mapping[str, Any]) -> SampleStart:
+    """Makes the function (one world, seed) -> starts, weather and cars as the first episode of `view` has them, and the traffic of that
+    time. It is compiled once for worlds of the same shapes, and raises ConfigError for a scene with heights or without a car that starts.
 
     Args:
         settings: groups of the environment; the dynamics is an articulated car.
-        scene: one world.
 
     Raises:
-        ConfigError: a key that does not fit, a scene with heights, or no car starts in this scene.
+        ConfigError: a key that does not fit.
     """
-    if scene.elevation is not None:
-        raise ConfigError("scenes.pack.elevation: an exported world is flat; expected null (scenes/pack/elevation=flat)")
     env, (reference, _) = environment.make_env(settings), read_parameters(settings["dynamics"])
     compute_mu = friction.make(settings["weather"]["friction"])
 
@@ -72,12 +71,18 @@ def sample_start(settings: Mapping[str, Any], scene: Scene, *, seed: int) -> Wor
         mean_speed = jnp.mean(speed, where=state.agents.present)
         return scene, varied, body.qpos, body.qvel, mu, compute_surface_mu(compute_mu, scene.weather, mean_speed)
 
-    scene, varied, qpos, qvel, mu, surface_mu = jax.device_get(start(jax.random.key(seed), scene))
-    if not scene.agents.present.any():
-        raise ConfigError("scenes: no car starts in this scene; for example skip=1 shows the next")
-    cars = [reference if varied is None else jax.tree.map(lambda leaf, slot=slot: float(leaf[slot]), varied) for slot in range(len(qpos))]
-    qpos, qvel, mu, surface_mu = (np.asarray(table, float) for table in (qpos, qvel, mu, surface_mu))
-    return WorldStart(scene, cars, qpos, qvel, mu, float(surface_mu[0]), surface_mu[1:][scene.weather.patches.present])
+    def sample(scene: Scene, seed: int) -> WorldStart:
+        if scene.elevation is not None:
+            raise ConfigError("scenes.pack.elevation: an exported world is flat; expected null (scenes/pack/elevation=flat)")
+        scene, varied, qpos, qvel, mu, surface_mu = jax.device_get(start(jax.random.key(seed), scene))
+        if not scene.agents.present.any():
+            raise ConfigError("scenes: no car starts in this scene; for example skip=1 shows the next")
+        take = lambda slot: jax.tree.map(lambda leaf: float(leaf[slot]), varied)  # noqa: E731
+        cars = [reference if varied is None else take(slot) for slot in range(len(qpos))]
+        qpos, qvel, mu, surface_mu = (np.asarray(table, float) for table in (qpos, qvel, mu, surface_mu))
+        return WorldStart(scene, cars, qpos, qvel, mu, float(surface_mu[0]), surface_mu[1:][scene.weather.patches.present])
+
+    return sample
 
 
 def compute_surface_mu(compute_mu: Callable[..., Array], weather: Weather, speed: Float[Array, ""]) -> Float[Array, " R"]:
@@ -88,11 +93,15 @@ def compute_surface_mu(compute_mu: Callable[..., Array], weather: Weather, speed
     return jax.vmap(lambda one: compute_mu(one, jnp.zeros(2), speed))(uniform)
 
 
-def write(out: Path, settings: Mapping[str, Any], scene: Scene, *, seed: int) -> Path:
-    """Writes the world and the script that drives it; arguments and errors as of `sample_start`."""
+def write(out: Path, settings: Mapping[str, Any], start: WorldStart) -> Path:
+    """Writes the world that begins so, and the script that drives it.
+
+    Args:
+        settings: those with which the start was sampled.
+    """
     dynamics = settings["dynamics"]
     model = world_mjcf.build(
-        sample_start(settings, scene, seed=seed),
+        start,
         read_parameters(dynamics)[1],
         schema.read(dynamics["contact"], ContactLaw, where="dynamics.contact"),
         abs_enabled=dynamics["abs"],

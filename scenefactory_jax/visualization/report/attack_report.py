@@ -26,7 +26,7 @@ def summarise(rows: Sequence[Mapping[str, Any]], *, seconds_per_scene: float) ->
     found = {
         "eligible": share([row in eligible for row in rows], rows),
         "collision": share([row["collision_s"] is not None for row in eligible], eligible),
-        "solvable": share([any(row[name] for name in solvers) for row in hit], hit),
+        **({"solvable": share([any(row[name] for name in solvers) for row in hit], hit)} if solvers else {}),
         **{name: share([row[name] for row in hit], hit) for name in solvers},
         "ego_at_fault": share([row["ego_at_fault"] for row in hit], hit),
         "adversary_at_fault": share([row["adversary_at_fault"] for row in hit], hit),

@@ -39,7 +39,7 @@ def write(folder: Path, result: SearchResult, scene: Scene, names: Sequence[str]
         format_headline(result, len(names), settings["search"]),
         *(document.picture(folder, path, caption) for path in pictures),
         document.section("Found", _format_table(result.found, names)),
-        document.section("Fails on the dry road", ", ".join(dry) or "In no scene."),
+        document.section("Left out: an event on the dry road", ", ".join(dry) or "In no scene."),
         document.section("How to repeat it", f"```\n{command}\n```", f"{result.drives} drives in {result.rounds} rounds."),
     )
 
@@ -50,7 +50,7 @@ def format_headline(result: SearchResult, worlds: int, search: Mapping[str, Any]
     for cover in search["covers"]:
         lengths = [one.extent_m for one in result.found if one.cover == cover]
         median = f"; least length {np.median(lengths):.1f} m (median), {min(lengths):.1f} m (smallest)" if lengths else ""
-        lines.append(f"- **{cover}**: {len(lengths)} of the {eligible} scenes without a failure on the dry road{median}")
+        lines.append(f"- **{cover}**: {len(lengths)} of the {eligible} scenes without an event on the dry road{median}")
     return "\n".join(lines)
 
 
