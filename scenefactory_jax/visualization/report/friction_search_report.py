@@ -84,5 +84,5 @@ def draw(found: Sequence[Found], scene: Scene, names: Sequence[str]) -> Figure:
         size = np.asarray(world.agents.size[EGO])
         figures.draw_car(axes, one.driven.position[0], float(one.driven.yaw[0]), size, drawing.colour_of(EGO), hollow=True)
         figures.draw_car(axes, one.driven.position[end], float(one.driven.yaw[end]), size, drawing.colour_of(EGO))
-        axes.set_title(f"{names[one.world][-24:]}\n{one.cover}, {one.extent_m:.1f} m: {one.failure.replace('_', ' ')}", fontsize=7)
+        axes.set_title(f"{names[one.world][-40:]}\n{one.cover}, {one.extent_m:.1f} m: {one.failure.replace('_', ' ')}", fontsize=7)
     return figure
