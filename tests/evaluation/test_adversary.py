@@ -261,7 +261,7 @@ def test_articulated_cars_and_the_c_engine_touch_where_trajectories_do(bank, loa
     meet = [tracks([[-20.0, 0.0], [0.0, -20.0 - late]], [0.0, NORTH], [8.0, 8.0]) for late in (0.0, 9.0)]
     pairs = Track(*(np.stack([np.asarray(leaf) for leaf in leaves]) for leaves in zip(*meet, strict=True)))
     worlds = jax.tree.map(lambda leaf: np.asarray(leaf)[:2], loaded.scene)
-    found = contact_replay.replay_pairs(task, worlds, pairs, np.full((2, 2, 2), [4.0, 2.0]), seconds=3.0)
+    found = contact_replay.replay_pairs(task, worlds, pairs, np.full((2, 2, 2), [4.0, 2.0]), seconds=3.0, worlds=1)
     assert found.articulated_s[0] == pytest.approx((20.0 - 3.0) / 8.0, abs=0.15)
     assert found.c_engine_s[0] == pytest.approx(found.articulated_s[0], abs=0.1)
     assert np.isnan(found.articulated_s[1]) and np.isnan(found.c_engine_s[1])
