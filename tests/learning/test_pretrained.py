@@ -61,7 +61,7 @@ def test_town_drives_on_other_scenes(tmp_path, quickly):
 
 
 def test_figures_of_the_readme_are_those_of_the_card():
-    row = r"^\| 64 held-out Waymo scenes \(test, protocol=recorded\) \| goal_only \| 369 \| (.+) \|$"
+    row = r"^\| 64 held-out Waymo scenes \(womd_test, protocol=recorded\) \| goal_only \| 369 \| (.+) \|$"
     rows = re.findall(row, TOWN.read_text(), re.MULTILINE)
     success, clean, _, collided, *_ = rows[0].split(" | ")
     said = " ".join((ROOT / "README.md").read_text().split())
