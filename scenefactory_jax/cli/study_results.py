@@ -130,29 +130,33 @@ def collect(plan: Plan, config: Mapping[str, Any], records: RowRecords) -> dict[
         "settings": {name: config[name] for name in ("seeds", "common", "cut", "target", "evaluation")},
         "scenes": {name: scene or "the recipe's own" for name, scene in scenes.items()},
         "missing": [task.label for task in (*chosen.trainings, *chosen.evaluations) if not task.file.is_file()],
-        "rows": [_summarise(key, runs, resampling) for key, runs in records.items() if runs],
-        "differences": _choose(_compare(study["compare"], records, resampling), study["metrics"]),
-        "drops": _choose(_compare_conditions(study["drops"], records, resampling), study["metrics"]),
+        "rows": [_summarise(key, runs, resampling, study["metrics"]) for key, runs in records.items() if runs],
+        "differences": _restrict(_compare(study["compare"], records, resampling), study["metrics"]),
+        "drops": _restrict(_compare_conditions(study["drops"], records, resampling), study["metrics"]),
         "trainings": {variant: _describe_trainings(variant, plan, config["target"]) for variant in study["trainings"]},
         "made_with": {"commit": run_config.find_commit(), **run_config.versions()},
     }
 
 
-def _summarise(key: RowKey, runs: statistics.Runs, resampling: Mapping[str, int]) -> dict[str, Any]:
+def _summarise(key: RowKey, runs: statistics.Runs, resampling: Mapping[str, int], metrics: list[str] | None) -> dict[str, Any]:
+    each = statistics.summarise_each_run(runs)
     first = next(iter(runs.values()))
     return {
         **dict(zip(("row", "condition", "protocol"), key, strict=True)), "seeds": list(runs), "agents": len(first["scene"]),
         "scenes": len(np.unique(first["scene"])), "agents_file": _agents_file(key),
         "friction": float(np.mean([records["friction"].mean() for records in runs.values()])),
-        "pooled": statistics.summarise_runs(runs, **resampling), "each": statistics.summarise_each_run(runs),
+        "pooled": _choose(statistics.summarise_runs(runs, **resampling), metrics),
+        "each": {seed: _choose(values, metrics) for seed, values in each.items()},
     }  # fmt: skip
 
 
-def _choose(changes: list[dict[str, Any]], metrics: list[str] | None) -> list[dict[str, Any]]:
-    """The differences of the study's own metrics, if it has any: those of all metrics, which nothing shows, are most of a large file."""
-    if metrics is None:
-        return changes
-    return [{**entry, "change": {name: entry["change"][name] for name in metrics if name in entry["change"]}} for entry in changes]
+def _restrict(changes: list[dict[str, Any]], metrics: list[str] | None) -> list[dict[str, Any]]:
+    return [{**entry, "change": _choose(entry["change"], metrics)} for entry in changes]
+
+
+def _choose(values: Mapping[str, Any], metrics: list[str] | None) -> dict[str, Any]:
+    """The values of the study's own metrics, if it has any: those of all metrics, which nothing shows, are most of a large file."""
+    return {name: value for name, value in values.items() if metrics is None or name in metrics}
 
 
 def _compare(pairs: Iterable[list[str]], records: RowRecords, resampling: Mapping[str, int]) -> list[dict[str, Any]]:

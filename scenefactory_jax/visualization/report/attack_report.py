@@ -32,6 +32,7 @@ def summarise(rows: Sequence[Mapping[str, Any]], *, seconds_per_scene: float) ->
         "adversary_at_fault": share([row["adversary_at_fault"] for row in hit], hit),
         "adversary_off_road": share([row["adversary_off_road"] for row in hit], hit),
         "log_off_road": share([row["log_off_road"] for row in hit], hit),
+        "off_road_by_attack": share([row["adversary_off_road"] and not row["log_off_road"] for row in hit], hit),
     }
     for engine in ("articulated", "c_engine"):
         asked = [row for row in hit if f"reproduced_{engine}" in row and row[f"reproduced_{engine}"] is not None]

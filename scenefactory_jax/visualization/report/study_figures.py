@@ -195,7 +195,7 @@ def _draw_drops(result: Result, protocol: str) -> Figure | None:
             for place, (row, points) in enumerate(rows.items()):
                 _draw_drop(axes, [(friction[row, before], before, None), *points], name, place=place, label=row)
             axes.axhline(0, color="#222222", linewidth=1)
-            axes.set(title=METRICS[name].label, xlabel="friction coefficient, mean under the agents", ylabel=f"less {before}")
+            axes.set(title=METRICS[name].label, xlabel="friction coefficient, mean under the agents", ylabel=f"difference from {before}")
             if METRICS[name].unit == FRACTION:
                 axes.yaxis.set_major_formatter(PercentFormatter(1.0))
     plots.add_legend(figure, ncols=4)
