@@ -16,12 +16,12 @@ from scenefactory_jax.cli.attack import PARTS, Tasks, attack
 from scenefactory_jax.core import config as run_config
 from scenefactory_jax.core import schema
 from scenefactory_jax.core.boxes import find_overlaps
-from scenefactory_jax.core.pytree import unchecked
+from scenefactory_jax.core.pytree import replace, unchecked
 from scenefactory_jax.core.schema import ConfigError
 from scenefactory_jax.core.types import Boxes
 from scenefactory_jax.data.bank import bank_reader
 from scenefactory_jax.data.loading import scene_source
-from scenefactory_jax.evaluation.adversary import costs, eligibility, kinematics
+from scenefactory_jax.evaluation.adversary import costs, eligibility, kinematics, search
 from scenefactory_jax.evaluation.adversary.costs import RoadShape
 from scenefactory_jax.evaluation.adversary.ego_drive import Drive, find_first_contact
 from scenefactory_jax.evaluation.adversary.kinematics import Track
@@ -37,7 +37,7 @@ CROSSER, PARKED, WALKER, FOLLOWER, ABSENT, TURNING = 1, 2, 3, 4, 5, 6
 
 def asked(path, out, *words):
     small = [f"overrides=[{','.join(SMALL)}]", "solution.planners=[]", "solution.iterations=60", "worlds=3"]
-    small += ["search.rounds=4", "search.starts=[[0.0,0.0],[0.3,0.0]]", "costs.road_segments=128"]
+    small += ["search.rounds=4", "search.starts=[[0.0,0.0],[0.3,0.0]]", "costs.road_segments=1024"]
     return hydra_config.load_config("attack", "planner=log", f"scenes.path={path}", f"out={out}", *small, *words)
 
 
@@ -213,16 +213,16 @@ def test_actions_follow_a_bend_and_a_stop(settings):
 
 
 @jax.jit
-def measure(shift, road):
+def measure(shift, road, half_lane_m=2.0):
     """Off-road cost of a car beside an edge at y = 4 with the road below it, whose places are moved by `shift` to the left."""
     track = tracks([[0.0, 3.5]], [0.0], [8.0])
     position = track.position + jnp.array([0.0, 1.0]) * shift
-    outside = costs.compute_outside(position, track.yaw, jnp.array([[[4.0, 2.0]]]), road, half_lane_m=2.0)
+    outside = costs.compute_outside(position, track.yaw, jnp.array([[[4.0, 2.0]]]), road, half_lane_m=half_lane_m)
     return costs.compute_off_road(outside, jnp.zeros(1), jnp.ones(outside.shape[:2], bool), margin_m=0.3), outside
 
 
 def test_the_off_road_term_sees_the_road():
-    """A corner 0.5 m beyond an edge costs, its gradient leads back; where there is a lane it does not."""
+    """A corner 0.5 m beyond an edge costs, its gradient leads back; where there is a lane it does not, unless the edges alone decide."""
     x = np.arange(-10.0, 70.0)
     edge = road_of([(15, np.stack([x[::-1], 0 * x + 4.0], -1))])
     lane, far = (road_of([(2, np.stack([x, 0 * x + y], -1))]) for y in (3.5, 0.0))
@@ -231,6 +231,20 @@ def test_the_off_road_term_sees_the_road():
     assert float(slope) == pytest.approx(2 * 2 * 0.8, rel=1e-2), "two corners, and more to the left"
     assert float(measure(-1.0, RoadShape(edge, far))[0]) == 0.0
     assert float(measure(0.0, RoadShape(edge, lane))[0]) == 0.0
+    assert float(measure(0.0, RoadShape(edge, lane), -jnp.inf)[0]) == pytest.approx(2 * 0.8**2, rel=1e-2)
+
+
+def test_edges_hold_for_a_vehicle_whose_log_stays_within_them(loaded, settings):
+    """And not where the map has them the wrong way round, so that the log itself is beyond them."""
+
+    @jax.jit
+    def read(scene):
+        chosen, _ = eligibility.choose_adversaries(scene, settings, start_row=CURRENT, steps=STEPS)
+        return search.make_logged_problem(scene, chosen, settings, start_row=CURRENT).half_lane_m[0, 0, 0]
+
+    scene = jax.tree.map(lambda leaf: jnp.asarray(leaf[0]), loaded.scene)
+    turned = replace(scene, edges=replace(scene.edges, direction=-scene.edges.direction))
+    assert float(read(scene)) == -jnp.inf and float(read(turned)) == settings.costs.half_lane_m
 
 
 def test_approach_and_repulsion_pull_and_push():

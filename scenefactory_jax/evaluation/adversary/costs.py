@@ -9,6 +9,7 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float
 
 from scenefactory_jax.core.boxes import compute_corners
@@ -84,12 +85,15 @@ def _crop(road: Road, wanted: Bool[Array, " P"], around: Float[Array, "N 2"], se
 
 
 def compute_outside(
-    position: Float[Array, "*n 2"], yaw: Float[Array, "*n"], size: Float[Array, "*m 2"], road: RoadShape, *, half_lane_m: float
+    position: Float[Array, "*n 2"], yaw: Float[Array, "*n"], size: Float[Array, "*m 2"], road: RoadShape, *, half_lane_m: ArrayLike
 ) -> Float[Array, "*n 4"]:
     """Computes how far the corners of cars are off the road, m, negative on it.
 
     A corner is off the road to the right of the nearest edge and farther than `half_lane_m` from all driving lanes: edges that a map has
     the wrong way round, or that cross a driveway, do not put a lane off the road. The gradient leads back over the nearer of the two.
+
+    Args:
+        half_lane_m: a number, or one for each corner (it broadcasts); -inf: the edges alone decide.
     """
     corners = compute_corners(position, yaw, jnp.broadcast_to(size, position.shape))
     distance, side = measure_segments(corners, road.edges)

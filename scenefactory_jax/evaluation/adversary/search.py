@@ -55,6 +55,7 @@ class Problem(NamedTuple):
     pairs: Bool[Array, "K O T"]  # pairs of an adversary and another road user that is there
     margin: Float[Array, "K O"]  # of their clearances: not above that of the log
     adversary_margin: Float[Array, "K K"]
+    half_lane_m: Float[Array, "K 1 1"]  # of lanes that are road, whatever the edges say; -inf if the log stays within the edges
     allowed: Float[Array, " K"]  # how far off the road the log leads
 
 
@@ -155,7 +156,9 @@ def make_problem(
 ) -> Problem:
     """Reads a world with traffic that does not react."""
     weights, followed = settings.costs, chosen.followed
-    road = costs.read_road(scene, followed.position[:, ::SPARSE].reshape(-1, 2), segments=weights.road_segments)
+    own_log = jnp.where(scene.log.valid[EGO, ::SPARSE, None], scene.log.position[EGO, ::SPARSE], followed.position[0, 0])
+    around = jnp.concatenate([followed.position[:, ::SPARSE].reshape(-1, 2), own_log])  # attacks lead from their logs to the ego
+    road = costs.read_road(scene, around, segments=weights.road_segments)
     speed = jnp.maximum(costs.find_speed(followed)[:, :-1], 0.0)
     push = jnp.full_like(speed, settings.limits.braking_mps2)
     scale = jnp.stack([push, kinematics.find_sharpest(speed, settings.limits)], axis=-1)
@@ -166,11 +169,14 @@ def make_problem(
     own = costs.cover(followed, chosen.size)
     logged = jnp.min(jnp.where(pairs, costs.compute_clearance(_pair(own), bodies), costs.FAR_M), axis=-1)
     among = jnp.min(jnp.where(_list_pairs(chosen), costs.compute_clearance(_pair(own), own), costs.FAR_M), axis=-1)
-    outside = costs.compute_outside(followed.position, followed.yaw, chosen.size[:, None], road, half_lane_m=weights.half_lane_m)
+    log = followed.position, followed.yaw, chosen.size[:, None], road
+    beyond_edges = jnp.where(there[..., None], costs.compute_outside(*log, half_lane_m=-jnp.inf), 0.0)
+    half_lane_m = jnp.where(jnp.max(beyond_edges, axis=(1, 2), keepdims=True) > 0.0, weights.half_lane_m, -jnp.inf)
+    outside = costs.compute_outside(*log, half_lane_m=half_lane_m)
     allowed = jnp.max(jnp.where(there[..., None], outside, 0.0), axis=(1, 2))
     margin = weights.repulsion_margin_m
     margins = jnp.minimum(logged, margin), jnp.minimum(among, margin)
-    return Problem(chosen, road, scale, bodies, taken, pairs, *margins, jnp.maximum(allowed, 0.0))
+    return Problem(chosen, road, scale, bodies, taken, pairs, *margins, half_lane_m, jnp.maximum(allowed, 0.0))
 
 
 def _pair(bodies: costs.Bodies) -> costs.Bodies:
@@ -216,7 +222,7 @@ def compute_upkeep(change: Float[Array, "K M 2"], track: Track, problem: Problem
     repulsion += costs.compute_repulsion(among, _list_pairs(chosen), margin_m=problem.adversary_margin)
     some = slice(None, None, weights.road_stride)
     places = track.position[:, some], track.yaw[:, some], chosen.size[:, None]
-    outside = costs.compute_outside(*places, problem.road, half_lane_m=weights.half_lane_m)
+    outside = costs.compute_outside(*places, problem.road, half_lane_m=problem.half_lane_m)
     off_road = costs.compute_off_road(outside, problem.allowed, there[:, some], margin_m=weights.off_road_margin_m)
     kept = weights.repulsion * repulsion + weights.off_road * off_road
     change, roughness = (jnp.sum(jnp.mean(part**2, axis=1)) for part in (change, jnp.diff(change, axis=1)))  # over cars and actions
@@ -229,7 +235,7 @@ def judge(scene: Scene, driven: Drive, track: Track, problem: Problem, settings:
     there = chosen.present & chosen.eligible[:, None]
     contact = ego_drive.find_first_contact(scene, driven)
     hit = contact.found & jnp.any((chosen.row == contact.row) & chosen.eligible)
-    outside = costs.compute_outside(track.position, track.yaw, chosen.size[:, None], problem.road, half_lane_m=settings.costs.half_lane_m)
+    outside = costs.compute_outside(track.position, track.yaw, chosen.size[:, None], problem.road, half_lane_m=problem.half_lane_m)
     beyond = jnp.max(outside, axis=-1) > problem.allowed[:, None] + OFF_ROAD_M
     off_road = jnp.any(beyond & there)
     overlaps = jnp.any(find_overlapping(track, driven.traffic, problem) & ~find_overlapping(chosen.followed, driven.traffic, problem))

@@ -53,7 +53,7 @@ def solve_by_gradient(scene: Scene, attack: Attack, settings: AttackSettings) ->
     around = Track(boxes.position, boxes.yaw, boxes.velocity), boxes.present, boxes.size[:, 0]
     problem = search.make_problem(scene, ego, *around, settings)
     find_outside = lambda track: costs.compute_outside(  # noqa: E731
-        track.position, track.yaw, ego.size[:, None], problem.road, half_lane_m=weights.half_lane_m
+        track.position, track.yaw, ego.size[:, None], problem.road, half_lane_m=problem.half_lane_m
     )
     before = jnp.arange(ego.followed.yaw.shape[1])[:, None] < attack.outcome.contact.step  # which may push the ego off the road
     allowed = jnp.max(jnp.where(before, find_outside(ego.followed), 0.0), axis=(1, 2))
