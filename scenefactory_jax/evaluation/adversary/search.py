@@ -156,8 +156,8 @@ def make_problem(
 ) -> Problem:
     """Reads a world with traffic that does not react."""
     weights, followed = settings.costs, chosen.followed
-    own_log = jnp.where(scene.log.valid[EGO, ::SPARSE, None], scene.log.position[EGO, ::SPARSE], followed.position[0, 0])
-    around = jnp.concatenate([followed.position[:, ::SPARSE].reshape(-1, 2), own_log])  # attacks lead from their logs to the ego
+    ego_log = jnp.where(scene.log.valid[EGO, ::SPARSE, None], scene.log.position[EGO, ::SPARSE], followed.position[0, 0])
+    around = jnp.concatenate([followed.position[:, ::SPARSE].reshape(-1, 2), ego_log])  # attacks lead from their logs to the ego
     road = costs.read_road(scene, around, segments=weights.road_segments)
     speed = jnp.maximum(costs.find_speed(followed)[:, :-1], 0.0)
     push = jnp.full_like(speed, settings.limits.braking_mps2)
