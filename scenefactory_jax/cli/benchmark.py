@@ -129,7 +129,8 @@ def _measure(
             return {"fits": True, **measure_stream(config, mesh=mesh)}
         worlds, account = scene_source.assign_scenes(load(config), config["worlds"], seed=config["seed"], mesh=mesh)
         print(f"{name}: {account}", flush=True)
-        return {"fits": True, **measure(config, worlds, mesh=mesh)}
+        with jax.default_matmul_precision(config["matmul_precision"]):
+            return {"fits": True, **measure(config, worlds, mesh=mesh)}
     except jax.errors.JaxRuntimeError as error:
         if "RESOURCE_EXHAUSTED" not in str(error):
             raise

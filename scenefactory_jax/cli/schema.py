@@ -196,6 +196,7 @@ class Benchmark(Learning):
     warmup: Seed
     repeats: Count
     scope: Literal["training", "environment", "physics"]
+    matmul_precision: Literal["default", "high", "highest"] | None
     phases: bool
     variants: dict[str, dict[str, Any]]
     baseline: Baseline | None
