@@ -16,7 +16,7 @@ from support.probes import AGENTS, ppo_config, probe, scenes
 from scenefactory_jax.cli import hydra_config as configs
 from scenefactory_jax.core.instantiate import ConfigError, instantiate
 from scenefactory_jax.core.types import SetObservation
-from scenefactory_jax.learning.networks import actor_critic, heads, squashed
+from scenefactory_jax.learning.networks import actor_critic, heads, late_fusion, squashed
 from scenefactory_jax.learning.ppo import train_iteration
 from scenefactory_jax.learning.training_loop import make_policy
 
@@ -146,15 +146,16 @@ def test_a_critic_has_as_many_values_as_its_learner():
     assert not mean[..., 2].any() and log_std[2] == 0.0  # the number that is not read
 
 
-def test_critics_lower_to_the_kernels_of_sets_on_a_gpu():
-    tile = lambda leaf: jnp.tile(leaf, (1, 1, 8, 1)[: leaf.ndim])  # noqa: E731
-    observation = OBSERVATION | {"road": jax.tree.map(tile, OBSERVATION["road"])}  # of few rows plain JAX is as quick
+@pytest.mark.parametrize("rows", [late_fusion.FEW, late_fusion.FEW + 1])
+def test_critics_lower_to_the_kernels_of_sets_of_more_than_few_rows_on_a_gpu(rows):
+    observation = OBSERVATION | {"road": jax.tree.map(lambda leaf: leaf[:, :, :rows], OBSERVATION["road"])}
     encoder = encoding.make_encoder("late_fusion", rows=[32, 64])
     network = heads.make_critic(encoder, 2, **HEAD)
     parameters = jax.eval_shape(network.init, jax.random.key(0), observation, ACTION)
     loss = jax.jit(jax.grad(lambda p: jnp.sum(network.apply(p, observation, ACTION))))
     with abstract_gpu():
-        assert "encode_set_gradient" in loss.trace(parameters).lower(lowering_platforms=("cuda",)).as_text()
+        program = loss.trace(parameters).lower(lowering_platforms=("cuda",)).as_text()
+    assert ("encode_set_gradient" in program, "encode_set" in program) == (rows > late_fusion.FEW,) * 2
 
 
 def with_neighbours(env):

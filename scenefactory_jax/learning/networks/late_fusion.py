@@ -6,7 +6,7 @@ vector joins the vector encoder, a set gets an encoder of `rows_default` widths.
 
 Rows are pooled before the last activation, which gives the same since activations increase. A pooled channel depends on one row, its
 winner, so that the gradient recomputes the winners and stores no activation of other rows: exact, in less time and memory. Sets with at
-most half as many rows as winners recompute all rows. On NVIDIA GPUs encoders of two layers run as one kernel where rows are many
+most half as many rows as winners recompute all rows. On NVIDIA GPUs encoders of two layers run as one kernel for sets of more than FEW rows
 (`set_kernel`), which is tested against the plain JAX here.
 
 Differences from the published code, which follow the paper instead: no LayerNorm, no extra 64 to 64 layer before the heads.
@@ -29,6 +29,8 @@ from scenefactory_jax.core.types import Observation, Policy, SetObservation
 from scenefactory_jax.learning.networks import set_kernel, squashed
 from scenefactory_jax.learning.networks.heads import ACTIVATIONS, invert_deviation, split_gaussian
 from scenefactory_jax.learning.networks.observation_blocks import check_groups
+
+FEW = 4  # rows: a kernel computes blocks of 32, of which more would be empty
 
 
 @dataclasses.dataclass(frozen=True)
@@ -247,12 +249,12 @@ def _winners(activation: str, dtype: str, kernels: bool, weights: list, x: Array
         return find_winners(affine(activation, dtype, weights, x), mask)
 
     quick = functools.partial(set_kernel.encode, activation, dtype)
-    return _on(kernels and not _has_few_rows(weights, mask) and set_kernel.fits(weights), quick, plain, weights, x, mask)
+    return _on(kernels and _suits_kernel(weights, mask), quick, plain, weights, x, mask)
 
 
-def _has_few_rows(weights: list, mask: Bool[Array, "*batch K"]) -> bool:
-    """Whether the gradient through all rows takes less time than through the winner of each channel: rows need no gather."""
-    return 2 * mask.shape[-1] <= weights[-1][0].shape[1]
+def _suits_kernel(weights: list, mask: Bool[Array, "*batch K"]) -> bool:
+    """Whether the kernels take less time than plain JAX on a GPU."""
+    return mask.shape[-1] > FEW and set_kernel.fits(weights)
 
 
 def _on(kernel: bool, quick: Callable, plain: Callable, *arguments: Any) -> Any:
@@ -267,9 +269,25 @@ def _encode_forward(activation: str, dtype: str, kernels: bool, weights: list, x
 def _encode_backward(activation: str, dtype: str, kernels: bool, residuals: tuple, cotangent: Array) -> tuple[list, Array, None]:
     weights, x, winner, mask = residuals
     cotangent = jnp.where(jnp.any(mask, axis=-1)[..., None], cotangent, 0.0)
-    if _has_few_rows(weights, mask):
-        won = winner[..., None, :] == jnp.arange(mask.shape[-1])[:, None]
-        return *_affine_backward(activation, dtype, weights, x, jnp.where(won, cotangent[..., None, :], 0.0)), None
+    few = 2 * mask.shape[-1] <= weights[-1][0].shape[1]  # rows need no gather
+    plain = functools.partial(_through_rows if few else _through_winners, activation, dtype)
+    quick = functools.partial(set_kernel.gradient, activation, dtype)
+    operands = (weights, x, winner, cotangent)
+    of_weights = _on(kernels and _suits_kernel(weights, mask), quick, lambda *operands: plain(*operands)[0], *operands)
+    return of_weights, plain(*operands)[1], None  # the compiler removes the gradient of the rows where it is not used
+
+
+encode_set.defvjp(_encode_forward, _encode_backward)
+
+
+def _through_rows(activation: str, dtype: str, weights: list, x: Array, winner: Array, cotangent: Array) -> tuple[list, Array]:
+    """Computes the gradient of weights and rows with all rows anew."""
+    won = winner[..., None, :] == jnp.arange(x.shape[-2])[:, None]
+    return _affine_backward(activation, dtype, weights, x, jnp.where(won, cotangent[..., None, :], 0.0))
+
+
+def _through_winners(activation: str, dtype: str, weights: list, x: Array, winner: Array, cotangent: Array) -> tuple[list, Array]:
+    """Computes the gradient of weights and rows with the winner of each channel anew."""
 
     def at_winners(weights: list, x: Array) -> Array:
         rows = jnp.take_along_axis(x, winner[..., None], axis=-2)  # [..., G, F]: the winner of each channel
@@ -278,16 +296,7 @@ def _encode_backward(activation: str, dtype: str, kernels: bool, residuals: tupl
             rows = ACTIVATIONS[activation](affine(activation, dtype, weights[:-1], rows)).astype(dtype)
         return jnp.einsum("...gh,hg->...g", rows, kernel.astype(rows.dtype), preferred_element_type=jnp.float32) + bias
 
-    def plain(weights: list, x: Array, winner: Array, cotangent: Array) -> list:
-        return jax.vjp(lambda weights: at_winners(weights, x), weights)[1](cotangent)[0]
-
-    quick = functools.partial(set_kernel.gradient, activation, dtype)
-    of_weights = _on(kernels and set_kernel.fits(weights), quick, plain, weights, x, winner, cotangent)
-    [of_rows] = jax.vjp(lambda x: at_winners(weights, x), x)[1](cotangent)  # removed by the compiler where it is not used
-    return of_weights, of_rows, None
-
-
-encode_set.defvjp(_encode_forward, _encode_backward)
+    return jax.vjp(at_winners, weights, x)[1](cotangent)
 
 
 def _affine_backward(
