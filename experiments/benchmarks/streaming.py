@@ -10,7 +10,7 @@ from jax.sharding import Mesh
 from scenefactory_jax.core.instantiate import ConfigError
 from scenefactory_jax.data.loading import stream
 from scenefactory_jax.env import environment
-from scenefactory_jax.learning import phase_timing
+from scenefactory_jax.learning import phase_timing, throughput
 from scenefactory_jax.learning.training_loop import Streams, make_policy, make_trainer, step
 
 
@@ -57,16 +57,11 @@ def _row(
     config: Mapping[str, Any], shape: tuple[int, ...], mesh: Mesh | None, seconds: list[float], rows: list[dict[str, float | int]]
 ) -> dict[str, Any]:
     """The figures that rows of a bench have in common."""
-    worlds, slots = shape
     horizon, spawned = phase_timing.control_steps(config), [row["steps/spawned"] for row in rows]
-    steps, whole = worlds * slots * horizon, sum(seconds)
+    steps, whole = shape[0] * shape[1] * horizon, sum(seconds)
     each = [count / taken for count, taken in zip(spawned, seconds, strict=True)]
     return {
-        "scope": config["scope"],
-        "worlds": worlds,
-        "slots": slots,
-        "devices": 1 if mesh is None else mesh.size,
-        "horizon": horizon,
+        **throughput.describe_size(config, shape, mesh),
         "per_s": sum(spawned) / whole,
         "per_s_range": [min(each), max(each)],
         "slots_per_s": steps * len(rows) / whole,

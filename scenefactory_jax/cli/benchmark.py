@@ -51,6 +51,9 @@ def benchmark(
             raise ConfigError(f"variants.{name}.stream: expected null; a stream is measured by {PROGRAM}")
     if config["baseline"] is not None and measure_baseline is None:
         raise ConfigError(f"baseline: expected null; the baseline is measured by {PROGRAM}")
+    there = jax.device_count()
+    for name in [name for name, task in tasks.items() if (task["devices"] or 1) > there and len(tasks) > 1]:
+        print(f"{name}: left out; {tasks.pop(name)['devices']} devices, there are {there}", flush=True)
     scene_source.use_compilation_cache()
     meshes, loaded, versions = {name: sharding.make_mesh(task["devices"]) for name, task in tasks.items()}, {}, run_config.versions()
     out = None if config["out"] is None else Path(config["out"])

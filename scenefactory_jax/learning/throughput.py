@@ -61,9 +61,9 @@ def measure(config: Mapping[str, Any], worlds: Scene, *, mesh: Mesh | None = Non
 
 
 def describe_size(config: Mapping[str, Any], shape: tuple[int, ...], mesh: Mesh | None) -> dict[str, Any]:
-    """Returns the scope and the sizes of a measurement; `shape` is worlds and slots."""
-    devices, horizon = 1 if mesh is None else mesh.size, phase_timing.control_steps(config)
-    return {"scope": config["scope"], "worlds": shape[0], "slots": shape[1], "devices": devices, "horizon": horizon}
+    """Returns the scope, the sizes and the time step of a measurement; `shape` is worlds and slots."""
+    devices, horizon, step_s = 1 if mesh is None else mesh.size, phase_timing.control_steps(config), 1.0 / config["timing"]["control_hz"]
+    return {"scope": config["scope"], "worlds": shape[0], "slots": shape[1], "devices": devices, "horizon": horizon, "step_s": step_s}
 
 
 def _time_training(

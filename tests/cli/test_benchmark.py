@@ -103,7 +103,7 @@ def test_the_readme_shows_what_was_measured():
     shares, said = re.findall(r"[\d,]+ steps/s|[\d.]+ times", report.split_ratios(result)), " ".join(text.split())
     assert len(shares) == 3 and all(share in said for share in shares)
     devices = report.compare_devices(result_file.read(ROOT / "experiments" / "devices" / "bench.json"))
-    assert f"{devices.splitlines()[-1].split(' | ')[-1].strip(' |')} times the slots" in said
+    assert f"{devices.splitlines()[-1].split(' | ')[-2]} times the slots" in said
 
 
 def test_only_the_whole_configuration_stands_beside_published_figures():
@@ -130,12 +130,31 @@ def test_the_ratio_is_split_into_plain_jax_and_kernels():
         assert report.split_ratios({"rows": [row, {**plain, **other}]}) == ""
 
 
-def test_devices_are_compared_by_slots():
+def test_devices_are_compared_by_slots_with_one_that_has_as_many_worlds():
     """Steps count spawned slots, whose share differs between worlds."""
-    one = {"name": "one", "devices": 1, "scope": "training", "fits": True, "slots_per_s": 100.0, "per_s": 40.0}
-    two = {**one, "name": "two", "devices": 2, "slots_per_s": 194.0, "per_s": 100.0}
-    assert report.compare_devices({"rows": [one, two]}).splitlines()[-1] == "| two | 2 | 194 | 1.94 |"
+    one = {"name": "one", "devices": 1, "worlds": 8, "scope": "training", "fits": True, "slots_per_s": 100.0, "per_s": 40.0}
+    large = {**one, "name": "large", "worlds": 16, "slots_per_s": 120.0}
+    two = {**one, "name": "two", "devices": 2, "worlds": 16, "slots_per_s": 194.0, "per_s": 100.0}
+    four = {**two, "name": "four", "devices": 4, "worlds": 64, "slots_per_s": 420.0}
+    assert report.compare_devices({"rows": [one, large, two, four]}).splitlines()[2:] == [
+        "| two | 2 | 194 | one | 1.94 | 97 % |",
+        "| four | 4 | 420 | large | 3.50 | 88 % |",
+    ]
     assert report.compare_devices({"rows": [one]}) == report.compare_devices({"rows": [two]}) == ""
+
+
+def test_rows_for_more_devices_than_there_are_are_left_out(monkeypatch, capsys):
+    numbers = dict.fromkeys(("per_s", "slots_per_s", "memory_gib", "compile_s"), 2.0) | {"spawned_share": 0.5, "active_share": None}
+    size = {"scope": "training", "worlds": 4, "slots": 4, "devices": 1, "horizon": 8, "step_s": 0.1, "ms_a_control_step": 1.0}
+    row = size | numbers | {"per_s": 8.766e6, "per_s_range": [1.0, 3.0], "phases_ms": {}, "repeats": 1}
+    monkeypatch.setattr(command, "measure", lambda task, worlds, mesh: row)
+    config = load_config("benchmark", *SMALL)
+    result = command.benchmark({**config, "variants": {"one": {"devices": 1}, "more": {"devices": 999}}})
+    printed = capsys.readouterr().out
+    assert [row["name"] for row in result["rows"]] == ["one"] and "more: left out; 999 devices, there are" in printed
+    assert "| 100 | 50 %" in printed  # years of driving in an hour
+    with pytest.raises(ConfigError, match="devices: 999"):
+        command.benchmark({**config, "devices": 999})
 
 
 def test_what_does_not_fit_is_a_row(monkeypatch, tmp_path, capsys):

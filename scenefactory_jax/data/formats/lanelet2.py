@@ -259,9 +259,7 @@ def _list_elements(record: Element, relations: Mapping[str, Element], subtype: s
     return [(element, tags) for element in found if element is not None and (tags := _read_tags(element)).get("subtype") == subtype]
 
 
-def _find_limit(
-    record: Element, tags: Mapping[str, str], relations: Mapping[str, Element], ways: Mapping[str, _Way]
-) -> float | None:
+def _find_limit(record: Element, tags: Mapping[str, str], relations: Mapping[str, Element], ways: Mapping[str, _Way]) -> float | None:
     """The speed limit of a lanelet, m/s: its own, or that of a rule or of the rule's sign; numbers without a unit are km/h."""
     texts = [tags.get("speed_limit", "")]
     for element, named in _list_elements(record, relations, "speed_limit"):

@@ -16,6 +16,7 @@ PUBLISHED = {(32, 16): 3_870, (256, 16): 19_250, (4096, 1): 41_742}  # SceneFact
 PUBLISHED_ON = "one RTX PRO 6000, PhysX, torch"
 COMPARABLE = ("scope", "worlds", "slots", "devices", "horizon")  # equal in rows that are compared
 SIZES = {"worlds", "scenes.pack.agents", "phases", "repeats", "warmup", "devices"}  # keys that do not change the configuration
+HOUR_S, YEAR_S = 3_600.0, 31_557_600.0
 TOO_LARGE = "does not fit into the device's memory"
 
 
@@ -41,9 +42,9 @@ def write(folder: Path, result: Mapping[str, Any]) -> Path:
     versions, sizes = result["versions"], _sizes(result)
     text = (
         "Steps a second are medians of whole iterations (training) or rollouts in steady state, smallest and largest in brackets. They "
-        "count control steps (30 Hz) of spawned slots; slots a second count the empty ones, too. Memory is what the compiled program holds "
-        "at once. The network multiplies float32 numbers at JAX's default precision, which means TF32 products on NVIDIA GPUs since "
-        "Ampere; the physics is in full float32."
+        "count control steps of spawned slots; slots a second count the empty ones, too; years an hour are the driving time of those steps "
+        "in an hour. Memory is what the compiled program holds at once. The network multiplies float32 numbers at JAX's default precision, "
+        "which means TF32 products on NVIDIA GPUs since Ampere; the physics is in full float32."
     )
     scaling = ""
     if len(sizes) > 2:
@@ -66,18 +67,19 @@ def write(folder: Path, result: Mapping[str, Any]) -> Path:
 
 def format_rows(rows: list[Row]) -> str:
     """Formats all rows as a table."""
-    header = ["Configuration", "Scope", "Worlds x slots", "Devices", "Horizon", "Steps/s", "Slots/s", "Spawned", "ms a control step",
-              "Memory, GiB", "Compile, s"]  # fmt: skip
+    header = ["Configuration", "Scope", "Worlds x slots", "Devices", "Horizon", "Steps/s", "Slots/s", "Years an hour", "Spawned",
+              "ms a control step", "Memory, GiB", "Compile, s"]  # fmt: skip
     cells = []
     for row in rows:
         place = [row["name"], row["scope"], _size(row), row["devices"], row["horizon"]]
         if not row["fits"]:
-            cells.append([*place, TOO_LARGE, "", "", "", "", ""])
+            cells.append([*place, TOO_LARGE, "", "", "", "", "", ""])
             continue
         spawned = f"{100 * row['spawned_share']:.0f} %"
         if row["active_share"] is not None:
             spawned += f", {100 * row['active_share']:.0f} % of them driving"
-        cells.append([*place, _steps_per_s(row), f"{row['slots_per_s']:,.0f}", spawned, f"{row['ms_a_control_step']:.2f}",
+        years = f"{row['per_s'] * row['step_s'] * HOUR_S / YEAR_S:.3g}" if "step_s" in row else ""
+        cells.append([*place, _steps_per_s(row), f"{row['slots_per_s']:,.0f}", years, spawned, f"{row['ms_a_control_step']:.2f}",
                       f"{row['memory_gib']:.1f}", f"{row['compile_s']:.0f}"])  # fmt: skip
     return markdown.format_table(header, cells)
 
@@ -115,17 +117,20 @@ def split_ratios(result: Mapping[str, Any]) -> str:
 
 
 def compare_devices(result: Mapping[str, Any]) -> str:
-    """Formats rows on several devices beside the first row on one; empty without any.
+    """Formats rows on several devices beside one device with as many worlds each, or else beside the first row on one; empty without any.
 
     Slots a second are compared, because the share of spawned slots depends on the number of worlds.
     """
-    single = next((row for row in _fitting(result) if row["devices"] == 1), None)
-    if single is None:
-        return ""
-    rows = [row for row in _fitting(result) if row["devices"] > 1 and row["scope"] == single["scope"]]
-    slots = [row["slots_per_s"] for row in rows]
-    cells = [[row["name"], row["devices"], f"{n:,.0f}", f"{n / single['slots_per_s']:.2f}"] for row, n in zip(rows, slots, strict=True)]
-    return markdown.format_table(["Configuration", "Devices", "Slots/s", f"Beside `{single['name']}`"], cells) if cells else ""
+    singles = [row for row in _fitting(result) if row["devices"] == 1]
+    cells = []
+    for row in _fitting(result):
+        others = [single for single in singles if single["scope"] == row["scope"]]
+        if row["devices"] > 1 and others:
+            single = next((other for other in others if other["worlds"] * row["devices"] == row["worlds"]), others[0])
+            ratio = row["slots_per_s"] / single["slots_per_s"]
+            share = f"{100 * ratio / row['devices']:.0f} %"
+            cells.append([row["name"], row["devices"], f"{row['slots_per_s']:,.0f}", single["name"], f"{ratio:.2f}", share])
+    return markdown.format_table(["Configuration", "Devices", "Slots/s", "Beside", "Ratio", "Efficiency"], cells) if cells else ""
 
 
 def streaming_table(result: Mapping[str, Any]) -> str:
