@@ -13,6 +13,7 @@ from jaxtyping import Float
 
 from scenefactory_jax.core.raw_scene import SceneError
 from scenefactory_jax.core.types import LANE_BIKE, LANE_FREEWAY, LANE_STREET
+from scenefactory_jax.data.formats.offset_loops import remove_loops
 from scenefactory_jax.data.formats.opendrive_curves import Column, Profile, ReferenceLine, read_profile, read_reference_line
 from scenefactory_jax.data.formats.scene_parts import SPEED_UNITS
 from scenefactory_jax.data.formats.xml_content import Element
@@ -87,6 +88,12 @@ class Road:
         bank = self.bank(s)
         aside = (t * np.cos(bank))[:, None] * np.stack([-np.sin(heading), np.cos(heading)], axis=1)
         return np.column_stack([points + aside, self.height(s) + t * np.sin(bank)])
+
+    def place_lane(self, s: Column, t: Column) -> Line:
+        """Points of a line beside the reference line, without loops in curves that are tighter than the distance between them."""
+        xyz, heading = self.place(s, t), self.line((s[:-1] + s[1:]) / 2)[1]
+        step = np.diff(xyz, axis=0)
+        return remove_loops(xyz, step[:, 0] * np.cos(heading) + step[:, 1] * np.sin(heading) < 0.0)
 
     def find_section(self, s: float) -> int:
         """The section at a place."""
@@ -166,7 +173,7 @@ class Road:
         record, kind = records[row], kinds[row]
         assert kind is not None
         forward = self._is_forward(record)
-        xyz = self.place(s, t)
+        xyz = self.place_lane(s, t)
         beside: dict[str, Key | None] = {"left": None, "right": None}
         order = [place for place, other in enumerate(records) if other.integer("id")]
         at = order.index(row)
