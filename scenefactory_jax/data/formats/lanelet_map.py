@@ -1,14 +1,14 @@
 """Lanes and road edges of maps of lanelets, which have a left and a right border: CommonRoad and Lanelet2."""
 
+import dataclasses
 import re
 from collections.abc import Container, Mapping, Sequence
-from dataclasses import dataclass
 
 import numpy as np
 
 from scenefactory_jax.core.raw_scene import Polyline
 from scenefactory_jax.core.types import EDGE_BOUNDARY
-from scenefactory_jax.data.formats import drivable_outline, polylines
+from scenefactory_jax.data.formats import drivable_outline, line_loops, polylines
 from scenefactory_jax.data.formats.argoverse2_map import centre
 from scenefactory_jax.data.formats.drivable_outline import OutlineNumbers, Points
 from scenefactory_jax.data.formats.scene_parts import SPEED_UNITS
@@ -16,7 +16,7 @@ from scenefactory_jax.data.formats.scene_parts import SPEED_UNITS
 SPEED = re.compile(r"(?:de274-)?(\d+(?:\.\d*)?)\s*(mph|km/h|kmh|kph|m/s|mps)?", re.IGNORECASE)  # 50, 30 mph, and de274-60 of Germany
 
 
-@dataclass(frozen=True, eq=False)
+@dataclasses.dataclass(frozen=True, eq=False)
 class Lanelet:
     """A lanelet in driving direction."""
 
@@ -46,6 +46,7 @@ def make_roads(
         spacing_m: maximum between the points of lanes and lines.
         unbounded: borders beside which the road goes on.
     """
+    lanelets = [dataclasses.replace(lanelet, left=_run_ahead(lanelet.left), right=_run_ahead(lanelet.right)) for lanelet in lanelets]
     lanes = {lanelet.id: lanelet for lanelet in lanelets if lanelet.kind is not None}
     centres = {number: centre(lanelet.left, lanelet.right, spacing_m) for number, lanelet in lanes.items()}
     areas = [np.concatenate([lanelet.left, lanelet.right[::-1]]) for lanelet in lanelets]
@@ -71,6 +72,11 @@ def make_roads(
     start = max(lanes, default=0) + 1
     others = [*marks.values(), *((EDGE_BOUNDARY, xyz) for xyz in edges), *features]
     return (*roads, *(Polyline(kind, xyz, start + place) for place, (kind, xyz) in enumerate(others)))
+
+
+def _run_ahead(border: Points) -> Points:
+    """A border without the parts that run back."""
+    return line_loops.remove_loops(border, line_loops.find_reversals(border))
 
 
 def parse_speed(text: str, usual: str | None) -> float | None:

@@ -13,7 +13,7 @@ from jaxtyping import Float
 
 from scenefactory_jax.core.raw_scene import SceneError
 from scenefactory_jax.core.types import LANE_BIKE, LANE_FREEWAY, LANE_STREET
-from scenefactory_jax.data.formats.offset_loops import remove_loops
+from scenefactory_jax.data.formats.line_loops import remove_loops
 from scenefactory_jax.data.formats.opendrive_curves import Column, Profile, ReferenceLine, read_profile, read_reference_line
 from scenefactory_jax.data.formats.scene_parts import SPEED_UNITS
 from scenefactory_jax.data.formats.xml_content import Element

@@ -1,12 +1,13 @@
-"""Loops of lanes on curves that are tighter than the lanes' distance from the middle of the road."""
+"""Lines that run back: lanes of curves that are tighter than their distance from the middle of the road, borders of overlapping pieces."""
 
 import numpy as np
 import pytest
 from support.scene_documents import FORMATS
 
-from scenefactory_jax.core.types import DRIVABLE
-from scenefactory_jax.data.formats import reader_selection
-from scenefactory_jax.data.formats.offset_loops import remove_loops
+from scenefactory_jax.core.types import DRIVABLE, LANE_STREET
+from scenefactory_jax.data.formats import lanelet_map, reader_selection
+from scenefactory_jax.data.formats.drivable_outline import OutlineNumbers
+from scenefactory_jax.data.formats.line_loops import find_reversals, remove_loops
 
 RADIUS_M, LEG_M = 2.0, 10.0
 CURVE_M = RADIUS_M * np.pi / 2
@@ -52,6 +53,48 @@ def test_a_wide_turn_is_as_it_was():
     points, back = turning(1.5)
     assert not back.any()
     np.testing.assert_array_equal(remove_loops(points, back), points)
+
+
+def along(*x, y=0.0):
+    """Points on a straight line, each second one a little to the side."""
+    return np.stack([x, y + 0.02 * (np.arange(len(x)) % 2), np.zeros(len(x))], axis=1).astype(float)
+
+
+@pytest.mark.parametrize(
+    ("x", "back", "kept"),
+    [
+        ((0, 1, 2, 3, 4, 5), [], (0, 1, 2, 3, 4, 5)),
+        ((0, 1, 2, 2, 3), [], (0, 1, 2, 2, 3)),  # a point twice
+        ((0, 1, 2, 1.9, 3), [2], None),
+        ((0, 2, 4, 6, 8, 7, 5, 3, 5, 7, 9, 11), [4, 5, 6], None),  # pieces that overlap by 5 m
+        ((0, 2, 4, 3, 5, 7, 6, 8), [2, 5], None),
+        ((0, 2, 4, 6, 4, 2), [], (0, 2, 4, 6, 4, 2)),  # it turns and goes on
+    ],
+)
+def test_pieces_that_overlap_run_on(x, back, kept):
+    points = along(*x)
+    found = find_reversals(points)
+    assert np.flatnonzero(found).tolist() == back
+    result = remove_loops(points, found)
+    np.testing.assert_array_equal(result[[0, -1]], points[[0, -1]])
+    if kept is None:
+        assert (np.diff(result[:, 0]) > 0).all() and np.abs(result[:, 1]).max() <= 0.02
+    else:
+        np.testing.assert_array_equal(result[:, 0], kept)
+
+
+def test_a_sharp_bend_is_no_reversal():
+    corner = np.array([[0, 0, 0], [5, 0, 0], [5, 3, 0], [0, 3, 0], [-5, 3, 0]], float)  # 90 degrees twice
+    hairpin = np.array([[0, 0, 0], [5, 0, 0], [0, 1, 0], [-5, 2, 0]], float)  # 169 degrees once
+    assert not find_reversals(corner).any() and not find_reversals(hairpin).any()
+
+
+def test_lanelets_with_overlapping_borders_have_lanes_that_run_on():
+    overlapping = (0, 2, 4, 6, 8, 10, 7, 3, 5, 9, 12, 14)
+    lanelet = lanelet_map.Lanelet(1, LANE_STREET, along(*overlapping, y=1.5), along(*overlapping, y=-1.5))
+    numbers = OutlineNumbers(**FORMATS["commonroad"]["outline"])
+    lane, *_ = lanelet_map.make_roads([lanelet], [], 2.0, numbers, "map")
+    assert (np.diff(lane.xyz[:, 0]) > 0).all() and lane.xyz[[0, -1], 0].tolist() == [0.0, 14.0]
 
 
 def test_lanes_of_a_tight_curve_do_not_run_back(tmp_path):
