@@ -84,6 +84,24 @@ def test_a_map_made_by_hand(tmp_path, readers):
             assert (lanes.query(beside)[0] < lanes.query(line.xyz[:-1, :2] + step / 2)[0]).mean() > 0.95
 
 
+def test_points_at_the_same_place_are_one(tmp_path, readers):
+    """As tools write them that know lanelets, not points: the lane ahead and both sides of the middle line have points of their own."""
+    text, links = lanelet2_document(), []
+    twin = '<node id="{}" lat="0" lon="0"><tag k="local_x" v="{}"/><tag k="local_y" v="{}"/><tag k="ele" v="{}"/></node>'
+    for height in (2, 6):  # 6: of a bridge over the road
+        nodes = "".join(twin.format(*row, height) for row in ((104, 40.01, 3.5), (106, 40, 0.01), (204, 40, 3.51), (203, 0, 3.5)))
+        ways = text.replace("<nd ref='4'/><nd ref='7'/>", "<nd ref='104'/><nd ref='7'/>")
+        ways = ways.replace("<nd ref='6'/><nd ref='8'/>", "<nd ref='106'/><nd ref='8'/>")
+        middle = '<way id="121"><nd ref=\'204\'/><nd ref=\'203\'/><tag k="type" v="line_thin"/><tag k="subtype" v="dashed"/></way>\n'
+        ways = ways.replace('<way id="22">', middle + '<way id="22">').replace('ref="21" role="left"', 'ref="121" role="left"')
+        path = tmp_path / "map.osm"
+        path.write_text(ways.replace('<node id="1"', nodes + '<node id="1"', 1))
+        (raw,) = read(path, readers)
+        left, right, ahead, aside = (line for line in raw.roads if line.kind in DRIVABLE)
+        links.append((ahead.id in right.exit, aside.id in right.exit, left.right == (right.id,)))
+    assert links == [(True, True, True), (False, False, False)]
+
+
 def test_a_recording_is_cut_into_scenes(readers, recording):
     scenes = read(recording, readers)
     assert [raw.name for raw in scenes] == ["SITE-vehicle_tracks_000-0", "SITE-vehicle_tracks_000-1"]

@@ -1,9 +1,9 @@
 """Lanelet2 maps (`.osm`): lanelets by their two borders, regulatory elements, and positions as latitude and longitude.
 
-Links and neighbours follow from shared points and borders (Poggenhans et al., "Lanelet2: A high-definition map framework", 2018).
-Positions are projected by the transverse Mercator projection of UTM (Krüger's series, to 1 mm), relative to (0, 0) for maps around it, as
-INTERACTION's, and to the first point for others; `local_x` and `local_y` of a point go before. Maps in
-left-handed axes are mirrored.
+Links and neighbours follow from shared points and borders, also from different ones at the same place (Poggenhans et al., "Lanelet2: A
+high-definition map framework", 2018). Positions are projected by the transverse Mercator projection of UTM (Krüger's series, to 1 mm),
+relative to (0, 0) for maps around it, as INTERACTION's, and to the first point for others; `local_x` and `local_y` of a point go before.
+Maps in left-handed axes are mirrored.
 """
 
 from collections import defaultdict
@@ -37,6 +37,7 @@ PHYSICAL = ("curbstone", "road_border", "guard_rail", "wall", "fence", "jersey_b
 LINES = ("line_thin", "line_thick")
 STOP_SIGNS = ("usR1-1", "de206", "stop_sign")  # the last one of Autoware
 AROUND_ZERO_DEG = 0.5  # a map nearer to (0, 0) is in local metres
+SAME_M = 0.05  # points that are nearer to each other are one
 OVERLAP_M2 = 1.0  # lanelets that share more area meet in a junction
 
 
@@ -52,7 +53,7 @@ class Map(NamedTuple):
 class _Way(NamedTuple):
     """A line: its points' ids, its points, and its tags."""
 
-    ids: tuple[str, ...]
+    ids: tuple[str, ...]  # one for all points at a place
     xyz: Points
     tags: dict[str, str]
 
@@ -85,7 +86,8 @@ def read_map(path: Path, *, point_spacing_m: float, outline: OutlineNumbers, ele
     """Reads the roads of a map; see `read`."""
     document = xml_content.load(path, ROOT, file_limit_mb=file_limit_mb, element_limit=element_limit)
     points, origin = _read_points(document)
-    ways = {record.get("id"): _read_way(record, points) for record in _list_records(document, "way")}
+    names = _name_places(points)
+    ways = {record.get("id"): _read_way(record, points, names) for record in _list_records(document, "way")}
     relations = {record.get("id"): record for record in _list_records(document, "relation")}
     if _is_mirrored(relations.values(), ways):
         ways = {number: way._replace(xyz=way.xyz * [1.0, -1.0, 1.0]) for number, way in ways.items()}
@@ -150,11 +152,20 @@ def _read_points(document: Element) -> tuple[dict[str, Float[np.ndarray, "3"]], 
     return points, (float(origin[0]), float(origin[1]), 0.0)
 
 
-def _read_way(record: Element, points: Mapping[str, np.ndarray]) -> _Way:
+def _name_places(points: Mapping[str, np.ndarray]) -> dict[str, str]:
+    """One id for all points at a place, by their ids: tools write the corner of two lanelets twice, and links follow from shared points."""
+    ids, xyz = list(points), np.array(list(points.values()))
+    near = KDTree(xyz).query_pairs(SAME_M, output_type="ndarray")
+    groups = connected_components(coo_array((np.ones(len(near)), near.T), shape=(len(ids), len(ids))), directed=False)[1]
+    first = np.unique(groups, return_index=True)[1]
+    return {name: ids[first[group]] for name, group in zip(ids, groups, strict=True)}
+
+
+def _read_way(record: Element, points: Mapping[str, np.ndarray], names: Mapping[str, str]) -> _Way:
     ids = tuple(node.get("ref") for node in record.all("nd"))
     if missing := [name for name in ids if name not in points]:
         raise SceneError(f"{record.where}: nd: expected the id of a node, got {missing[0][:20]!r}")
-    return _Way(ids, np.array([points[name] for name in ids]).reshape(-1, 3), _read_tags(record))
+    return _Way(tuple(names[name] for name in ids), np.array([points[name] for name in ids]).reshape(-1, 3), _read_tags(record))
 
 
 def _is_mirrored(relations: Iterable[Element], ways: Mapping[str, _Way]) -> bool:
