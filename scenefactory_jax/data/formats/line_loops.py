@@ -53,8 +53,8 @@ def find_reversals(xyz: Float[np.ndarray, "N 3"]) -> Bool[np.ndarray, " N-1"]:
 
 def _find_crossing(xyz: Float[np.ndarray, "N 3"], start: int, stop: int) -> tuple[int, Float[np.ndarray, "C 3"], int]:
     """Finds where the parts before row `start` and behind row `stop` cross: the row before, the crossing, the row behind."""
-    before, after = (shapely.linestrings(np.stack([part[:-1], part[1:]], axis=1)) for part in (xyz[: start + 1, :2], xyz[stop:, :2]))
-    hits = shapely.STRtree(after).query(before, predicate="intersects") if len(before) and len(after) else np.zeros((2, 0), int)
+    before, after = (_list_segments(part) for part in (xyz[: start + 1], xyz[stop:]))
+    hits = shapely.STRtree(after).query(before, predicate="intersects") if before and after else np.zeros((2, 0), int)
     if not hits.size:  # as two borders beside each other, or where the line begins or ends within the turn
         ahead = (xyz[stop + 1 :, :2] - xyz[start, :2]) @ (xyz[start, :2] - xyz[stop, :2]) > 0.0
         return start, xyz[:0], stop + 1 + int(np.argmax(ahead)) if ahead.any() else len(xyz) - 1
@@ -62,3 +62,7 @@ def _find_crossing(xyz: Float[np.ndarray, "N 3"], start: int, stop: int) -> tupl
     place = shapely.centroid(shapely.intersection(before[one], after[other]))
     share = shapely.line_locate_point(before[one], place, normalized=True)
     return int(one), (xyz[one] + share * (xyz[one + 1] - xyz[one]))[None], stop + int(other) + 1
+
+
+def _list_segments(line: Float[np.ndarray, "N 3"]) -> list[shapely.LineString]:
+    return [shapely.LineString(pair) for pair in zip(line[:-1, :2], line[1:, :2], strict=True)]
