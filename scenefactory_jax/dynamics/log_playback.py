@@ -72,3 +72,4 @@ def make(
         return tree_where(active, moved, replace(body, motion=replace(body.motion, contact_force=jnp.zeros_like(force))))
 
     return Dynamics(init=init, advance=advance, read=lambda body: body.motion)
+

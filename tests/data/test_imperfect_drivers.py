@@ -60,8 +60,8 @@ def test_drivers_drift_speed_and_run_red_lights(plain):
 
 @pytest.mark.slow
 def test_drivers_turn_on_red():
-    assert sum(count_red(town(index)) for index in (6, 8)) == 0
-    assert sum(count_red(town(index, turning_on_red=1.0)) for index in (6, 8)) >= 1
+    assert sum(count_red(town(index)) for index in (6, 16)) == 0
+    assert sum(count_red(town(index, turning_on_red=1.0)) for index in (6, 16)) >= 1
 
 
 def test_a_fraction_beyond_one_is_refused():
