@@ -102,6 +102,15 @@ def test_points_at_the_same_place_are_one(tmp_path, readers):
     assert links == [(True, True, True), (False, False, False)]
 
 
+def test_any_number_of_points_may_be_at_one_place(tmp_path, readers):
+    """All pairs of so many points would not fit into memory."""
+    node = '<node id="{}" lat="0" lon="0"><tag k="local_x" v="0"/><tag k="local_y" v="7"/></node>'
+    path = tmp_path / "map.osm"
+    path.write_text(lanelet2_document().replace('<node id="1"', "".join(node.format(1000 + n) for n in range(30_000)) + '<node id="1"', 1))
+    (raw,) = read(path, readers)
+    assert sum(line.kind in DRIVABLE for line in raw.roads) == 4
+
+
 def test_a_recording_is_cut_into_scenes(readers, recording):
     scenes = read(recording, readers)
     assert [raw.name for raw in scenes] == ["SITE-vehicle_tracks_000-0", "SITE-vehicle_tracks_000-1"]

@@ -37,7 +37,7 @@ PHYSICAL = ("curbstone", "road_border", "guard_rail", "wall", "fence", "jersey_b
 LINES = ("line_thin", "line_thick")
 STOP_SIGNS = ("usR1-1", "de206", "stop_sign")  # the last one of Autoware
 AROUND_ZERO_DEG = 0.5  # a map nearer to (0, 0) is in local metres
-SAME_M = 0.05  # points that are nearer to each other are one
+SAME_M, CELL_M = 0.05, 0.01  # points that are nearer to each other are one, to within a cell
 OVERLAP_M2 = 1.0  # lanelets that share more area meet in a junction
 
 
@@ -155,8 +155,10 @@ def _read_points(document: Element) -> tuple[dict[str, Float[np.ndarray, "3"]], 
 def _name_places(points: Mapping[str, np.ndarray]) -> dict[str, str]:
     """One id for all points at a place, by their ids: tools write the corner of two lanelets twice, and links follow from shared points."""
     ids, xyz = list(points), np.array(list(points.values()))
-    near = KDTree(xyz).query_pairs(SAME_M, output_type="ndarray")
-    groups = connected_components(coo_array((np.ones(len(near)), near.T), shape=(len(ids), len(ids))), directed=False)[1]
+    cells, cell = np.unique(np.round(xyz / CELL_M), axis=0, return_inverse=True)  # a file may have any number of points at a place
+    near = KDTree(cells * CELL_M).query_pairs(SAME_M, output_type="ndarray")
+    components = connected_components(coo_array((np.ones(len(near)), near.T), shape=(len(cells), len(cells))), directed=False)[1]
+    groups = components[cell.reshape(-1)]
     first = np.unique(groups, return_index=True)[1]
     return {name: ids[first[group]] for name, group in zip(ids, groups, strict=True)}
 

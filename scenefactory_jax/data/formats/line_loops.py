@@ -11,7 +11,7 @@ import numpy as np
 import shapely
 from jaxtyping import Bool, Float
 
-REVERSAL = np.cos(2.0)  # of the angle between two steps, 115 degrees: hairpins of few points turn by less
+REVERSAL = np.cos(2.0)  # of the angle between two steps: 115 degrees
 SAME_WAY = np.cos(np.pi / 3)
 
 
