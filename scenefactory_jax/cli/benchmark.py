@@ -128,11 +128,11 @@ def _measure(
 ) -> dict[str, Any]:
     """Measures one configuration; of one that does not fit into memory, returns its size."""
     try:
-        if measure_stream is not None and config["stream"] is not None:
-            return {"fits": True, **measure_stream(config, mesh=mesh)}
-        worlds, account = scene_source.assign_scenes(load(config), config["worlds"], seed=config["seed"], mesh=mesh)
-        print(f"{name}: {account}", flush=True)
         with jax.default_matmul_precision(config["matmul_precision"]):
+            if measure_stream is not None and config["stream"] is not None:
+                return {"fits": True, **measure_stream(config, mesh=mesh)}
+            worlds, account = scene_source.assign_scenes(load(config), config["worlds"], seed=config["seed"], mesh=mesh)
+            print(f"{name}: {account}", flush=True)
             return {"fits": True, **measure(config, worlds, mesh=mesh)}
     except jax.errors.JaxRuntimeError as error:
         if "RESOURCE_EXHAUSTED" not in str(error):

@@ -23,6 +23,11 @@ SMALL = ("experiment=smoke", "dynamics=bicycle", "worlds=4", "warmup=0", "repeat
 SMALL += ("~observations.road", "~observations.neighbours")  # less to compile
 VARIANTS = {scope: {"scope": scope, "phases": False} for scope in ("training", "environment", "physics")}
 VARIANTS["physics"]["worlds"] = 2
+ROW = {
+    "scope": "training", "worlds": 4, "slots": 4, "devices": 1, "horizon": 8, "step_s": 0.1, "ms_a_control_step": 1.0, "per_s": 17.532e6,
+    "per_s_range": [1.0, 3.0], "slots_per_s": 2.0, "spawned_share": 0.5, "active_share": 0.5, "phases_ms": {}, "memory_gib": 2.0,
+    "compile_s": 2.0, "repeats": 1,
+}  # fmt: skip
 
 
 @pytest.fixture(scope="module")
@@ -144,10 +149,7 @@ def test_devices_are_compared_by_slots_with_one_that_has_as_many_worlds():
 
 
 def test_rows_for_more_devices_than_there_are_are_left_out(monkeypatch, capsys):
-    numbers = dict.fromkeys(("per_s", "slots_per_s", "memory_gib", "compile_s"), 2.0) | {"spawned_share": 0.5, "active_share": None}
-    size = {"scope": "training", "worlds": 4, "slots": 4, "devices": 1, "horizon": 8, "step_s": 0.1, "ms_a_control_step": 1.0}
-    row = size | numbers | {"per_s": 8.766e6, "per_s_range": [1.0, 3.0], "phases_ms": {}, "repeats": 1}
-    monkeypatch.setattr(command, "measure", lambda task, worlds, mesh: row)
+    monkeypatch.setattr(command, "measure", lambda task, worlds, mesh: ROW)
     config = load_config("benchmark", *SMALL)
     result = command.benchmark({**config, "variants": {"one": {"devices": 1}, "more": {"devices": 999}}})
     printed = capsys.readouterr().out
@@ -155,6 +157,17 @@ def test_rows_for_more_devices_than_there_are_are_left_out(monkeypatch, capsys):
     assert "| 100 | 50 %" in printed  # years of driving in an hour
     with pytest.raises(ConfigError, match="devices: 999"):
         command.benchmark({**config, "devices": 999})
+
+
+@pytest.mark.parametrize("stream", [None, "shuffled"])
+def test_products_have_the_precision_that_is_asked_for(stream, monkeypatch):
+    asked, full = [], {**ROW, "stream": None}
+    measure = lambda *_, mesh: asked.append(jax.config.jax_default_matmul_precision) or full  # noqa: E731
+    monkeypatch.setattr(command, "measure", measure)
+    config = load_config("benchmark", *SMALL, *([f"stream={stream}"] if stream else []))
+    for precision in (None, "highest"):
+        command.benchmark({**config, "matmul_precision": precision}, measure_stream=measure)
+    assert asked == [None, "highest"] and jax.config.jax_default_matmul_precision is None
 
 
 def test_what_does_not_fit_is_a_row(monkeypatch, tmp_path, capsys):

@@ -9,6 +9,7 @@ from matplotlib.figure import Figure
 
 from scenefactory_jax.core import markdown
 from scenefactory_jax.core.config import flatten
+from scenefactory_jax.learning.training_loop import YEAR_S
 from scenefactory_jax.visualization.report import document, plots
 
 Row = Mapping[str, Any]
@@ -16,7 +17,6 @@ PUBLISHED = {(32, 16): 3_870, (256, 16): 19_250, (4096, 1): 41_742}  # SceneFact
 PUBLISHED_ON = "one RTX PRO 6000, PhysX, torch"
 COMPARABLE = ("scope", "worlds", "slots", "devices", "horizon")  # equal in rows that are compared
 SIZES = {"worlds", "scenes.pack.agents", "phases", "repeats", "warmup", "devices"}  # keys that do not change the configuration
-HOUR_S, YEAR_S = 3_600.0, 31_557_600.0
 TOO_LARGE = "does not fit into the device's memory"
 
 
@@ -42,7 +42,7 @@ def write(folder: Path, result: Mapping[str, Any]) -> Path:
     versions, sizes = result["versions"], _sizes(result)
     text = (
         "Steps a second are medians of whole iterations (training) or rollouts in steady state, smallest and largest in brackets. They "
-        "count control steps of spawned slots; slots a second count the empty ones, too; years an hour are the driving time of those steps "
+        "count control steps of spawned slots; slots a second count the empty ones, too; years an hour are the time that active cars drive "
         "in an hour. Memory is what the compiled program holds at once. The network multiplies float32 numbers at JAX's default precision, "
         "which means TF32 products on NVIDIA GPUs since Ampere; the physics is in full float32."
     )
@@ -75,10 +75,11 @@ def format_rows(rows: list[Row]) -> str:
         if not row["fits"]:
             cells.append([*place, TOO_LARGE, "", "", "", "", "", ""])
             continue
-        spawned = f"{100 * row['spawned_share']:.0f} %"
+        spawned, years = f"{100 * row['spawned_share']:.0f} %", ""
         if row["active_share"] is not None:
             spawned += f", {100 * row['active_share']:.0f} % of them driving"
-        years = f"{row['per_s'] * row['step_s'] * HOUR_S / YEAR_S:.3g}" if "step_s" in row else ""
+            if "step_s" in row:  # older rows have none
+                years = f"{3600.0 * row['per_s'] * row['active_share'] * row['step_s'] / YEAR_S:.3g}"
         cells.append([*place, _steps_per_s(row), f"{row['slots_per_s']:,.0f}", years, spawned, f"{row['ms_a_control_step']:.2f}",
                       f"{row['memory_gib']:.1f}", f"{row['compile_s']:.0f}"])  # fmt: skip
     return markdown.format_table(header, cells)
