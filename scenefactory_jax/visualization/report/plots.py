@@ -219,7 +219,11 @@ def safety_figure(table: Mapping[str, Records]) -> Figure:
 
 def write_digits(axis: Axis) -> None:
     """Labels a logarithmic axis with numbers (1024, 0.0005) instead of powers."""
-    axis.set_major_formatter(FuncFormatter(lambda value, place: np.format_float_positional(value, precision=3, fractional=False, trim="-")))
+
+    def write_number(value: float, _: int) -> str:
+        return f"{value:.0f}" if value >= 100 else np.format_float_positional(value, precision=3, fractional=False, trim="-")
+
+    axis.set_major_formatter(FuncFormatter(write_number))
     axis.set_minor_formatter(NullFormatter())
 
 
