@@ -363,6 +363,13 @@ def test_mistakes_are_named(overrides, message):
         pass
 
 
+def test_processes_with_nothing_to_load_are_named(capsys):
+    for workers, said in ((2, True), (1, False)):
+        few = entry("stream.prefetch=1", "stream.swap_fraction=0.01", f"stream.workers={workers}")
+        with stream.open_stream(few, mesh=None, before=None):
+            assert ("stream.workers: 2 processes for stream.prefetch=1 x 1 worlds: the others" in capsys.readouterr().out) == said
+
+
 def test_errors_of_the_loader_surface_by_name_and_never_hang(capsys):
     context, swap = flowing(entry(unusable=[6], broken=[9]))
     with pytest.raises(RuntimeError, match="generated scene 9: cannot be loaded: ZeroDivisionError: a bug"), context as flow:

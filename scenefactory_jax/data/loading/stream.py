@@ -328,6 +328,9 @@ def open_stream(config: Mapping[str, Any], *, mesh: Mesh | None, before: Mapping
         stack.callback(queue.close)
         rows = ", ".join(f"{rows} {name}" for name, rows in sizes.items())
         LOG.info(f"stream of {source.description}: {swapped} of {worlds} worlds an iteration, each of {rows}")
+        if 0 < settings.prefetch * swapped < settings.workers:
+            ahead = f"stream.prefetch={settings.prefetch} x {swapped} worlds"
+            LOG.info(f"stream.workers: {settings.workers} processes for {ahead}: the others have nothing to load; raise prefetch")
         yield SceneStream(source, settings, sampler, swapped, queue.add, before, parts)
 
 
