@@ -41,10 +41,11 @@ def write(folder: Path, result: Mapping[str, Any]) -> Path:
     """Writes `folder`/throughput.md and its figure, and returns the path of the text."""
     versions, sizes = result["versions"], _sizes(result)
     text = (
-        "Steps a second are medians of whole iterations (training; with a stream of scenes, of all iterations together) or rollouts in steady "
-        "state, smallest and largest in brackets. They count control steps of spawned slots; slots a second count the empty ones, too; years an hour are the time that active cars drive "
-        "in an hour. Memory is what the compiled program holds at once. The network multiplies float32 numbers at JAX's default precision, "
-        "which means TF32 products on NVIDIA GPUs since Ampere; the physics is in full float32."
+        "Steps a second are medians of whole iterations (training; with a stream of scenes, of all iterations together) or rollouts in "
+        "steady state, smallest and largest in brackets. They count control steps of spawned slots; slots a second count the empty "
+        "ones, too; years an hour are the time that active cars drive in an hour. Memory is what the compiled program holds at once. "
+        "The network multiplies float32 numbers at JAX's default precision, which means TF32 products on NVIDIA GPUs since Ampere; the "
+        "physics is in full float32."
     )
     scaling = ""
     if len(sizes) > 2:
