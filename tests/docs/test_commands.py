@@ -21,12 +21,14 @@ WINDOW = "window=true"  # and a keyboard: tests/visualization/test_keyboard_cont
 SHORTER = {  # words of the pages, and what stands for them here
     **{f"experiment={name}": "experiment=smoke" for name in ("demo", "quick", "published", "laptop")},
     "scenes.workers=8": "scenes.workers=2",
+    "scenes.path=SCENES": "scenes.path=WOMD/test",
     "suite=throughput": "suite=single",  # its rows are what one GPU holds
     "common=[minutes=2]": "common=[iterations=1]",
     "until_s=540": "until_s=5400",
     "out=train.bank": "out=again.bank",  # that one is there already
     "select.filter=moving_vehicles >= 8 and intersections > 0": "select.filter=moving_vehicles >= 2",
 }
+FEW = ["worlds=2", "scenes.count=4", "scenes.heldout.count=2"]  # of an experiment for a GPU
 SMALL = {
     "train": ["progress=false", "iterations=1", "evaluation.video.enable=false", "evaluation.untrained=false"],
     "benchmark": ["worlds=4", "warmup=0", "repeats=1"],
@@ -93,6 +95,7 @@ def test_a_command_of_the_pages_runs(desk, line):
     words = [SHORTER.get(word, word) for word in words]
     if command in ("train", "record", "benchmark") and not any(word.startswith("experiment=") for word in words):
         words.append("experiment=smoke")
+    words += FEW if "experiment=drive" in words else []
     words += SMALL.get(command, [])
     done = shell(desk, command, *words, **QUICKLY)
     assert done.returncode == 0, f"{shlex.join([command, *words])}\n{done.stdout[-1500:]}\n{done.stderr[-2500:]}"
