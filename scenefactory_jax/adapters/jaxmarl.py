@@ -47,9 +47,7 @@ class Drive(MultiAgentEnv):
         config, overrides, scenes: as of `episodes.make_pool`.
     """
 
-    def __init__(
-        self, config: Mapping[str, Any] | None = None, overrides: Sequence[str] = (), scenes: scene_source.Scenes | None = None
-    ):
+    def __init__(self, config: Mapping[str, Any] | None = None, overrides: Sequence[str] = (), scenes: scene_source.Scenes | None = None):
         self.pool = episodes.make_pool(config, overrides, scenes, alone=False, respawns=True)
         super().__init__(num_agents=self.pool.agents)
         self.agents = self.pool.cars

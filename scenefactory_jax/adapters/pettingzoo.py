@@ -37,9 +37,7 @@ class Drive(ParallelEnv):
         config, overrides, scenes: as of `episodes.make_pool`.
     """
 
-    def __init__(
-        self, config: Mapping[str, Any] | None = None, overrides: Sequence[str] = (), scenes: scene_source.Scenes | None = None
-    ):
+    def __init__(self, config: Mapping[str, Any] | None = None, overrides: Sequence[str] = (), scenes: scene_source.Scenes | None = None):
         self.pool = episodes.make_pool(config, overrides, scenes, alone=False)
         self.names, self.render_mode = self.pool.names, None
         self.metadata = {"name": "scenefactory_jax_v0", "render_modes": [], "render_fps": self.pool.step_hz, "is_parallelizable": True}

@@ -176,9 +176,7 @@ def _read(entry: Entry) -> Iterator[RawScene | Reject]:
         yield explain(error, entry.source)
 
 
-def complete(
-    raw: RawScene, *, check: Check, rebuild: Callable[[RawScene], RawScene], gate: Callable[[RawScene], RawScene]
-) -> RawScene:
+def complete(raw: RawScene, *, check: Check, rebuild: Callable[[RawScene], RawScene], gate: Callable[[RawScene], RawScene]) -> RawScene:
     """The scene with lane links where its source has none, without what the quality rules leave out: the `refine` of a bank."""
     check(raw)  # refuses what the geometry of the next two cannot use
     return gate(rebuild(raw))

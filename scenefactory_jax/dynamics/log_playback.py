@@ -72,4 +72,3 @@ def make(
         return tree_where(active, moved, replace(body, motion=replace(body.motion, contact_force=jnp.zeros_like(force))))
 
     return Dynamics(init=init, advance=advance, read=lambda body: body.motion)
-

@@ -139,9 +139,7 @@ class _Driven(NamedTuple):
     frames: episodes.EpisodeFrame | None  # of the recorded worlds, [W, T, ...]
 
 
-def _make_driver(
-    config: Mapping[str, Any], *, settings: Mapping[str, Any], recorded_worlds: int
-) -> Callable[[Any, Scene, Array], _Driven]:
+def _make_driver(config: Mapping[str, Any], *, settings: Mapping[str, Any], recorded_worlds: int) -> Callable[[Any, Scene, Array], _Driven]:
     """Returns a function (parameters, worlds, keys) that runs an episode in every world, until all worlds are done."""
     spawning = {**config["spawning"], "respawn_clearance_m": None}  # one episode an agent, also if training respawned it
     task = {**config, "spawning": spawning, "reward": rewards.hold_weights(config["reward"])}

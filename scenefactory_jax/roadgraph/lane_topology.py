@@ -124,9 +124,7 @@ def _find_left_branches(starts: Ends, stops: Ends, samples: Samples, **link: flo
     for ends, backwards in ((starts, False), (stops, True)):
         one, other = np.nonzero(_find_meeting_ends(ends, ends, **link) & long)
         along = (np.minimum(count[one], count[other]) - 1) // 2  # halfway along the shorter lane they are well apart
-        here, there = (
-            samples.xyz[first[lane] + (count[lane] - 1 - along if backwards else along), :2] for lane in (one, other)
-        )
+        here, there = (samples.xyz[first[lane] + (count[lane] - 1 - along if backwards else along), :2] for lane in (one, other))
         ahead, offset = ends.direction[one], there - here
         left[one, other] |= ahead[:, 0] * offset[:, 1] - ahead[:, 1] * offset[:, 0] > 0
     return left

@@ -56,7 +56,7 @@ def parse(text: str, schema: pa.Schema, *, where: str) -> pc.Expression:
         ConfigError: see `rows`.
     """
     if not isinstance(text, str) or not text.strip():
-        raise ConfigError(f'{where}: {text!r} is no condition; write one such as \'vehicles >= 8 and dataset == "WOMD"\'')
+        raise ConfigError(f"{where}: {text!r} is no condition; write one such as 'vehicles >= 8 and dataset == \"WOMD\"'")
     try:
         tree = ast.parse(text.strip(), mode="eval")
         return _expression(tree.body, text.strip(), schema, where)

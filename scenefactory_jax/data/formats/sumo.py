@@ -116,9 +116,7 @@ def _make_scene(path: Path, net: Net, *, name: str, times: np.ndarray, lights: t
     tokens = {"features": scene_parts.list_tokens(net.ids)} | entries.pop("tokens", {})
     known = {"tracks": (), "current": 0} | entries
     metadata |= known.pop("metadata", {}) | {"tokens": tokens}
-    return RawScene(
-        name=name, source=str(path), roads=net.roads, times=times, lights=lights, origin=net.origin, metadata=metadata, **known
-    )
+    return RawScene(name=name, source=str(path), roads=net.roads, times=times, lights=lights, origin=net.origin, metadata=metadata, **known)
 
 
 # ---- files

@@ -123,9 +123,7 @@ def make(features: Features, *, path: Path, record: Record, jump_m: float) -> Ra
     )
 
 
-def _states(
-    features: Features, objects: int
-) -> tuple[Float[np.ndarray, "A L 9"], Bool[np.ndarray, "A L"], Float[np.ndarray, " L"], int]:
+def _states(features: Features, objects: int) -> tuple[Float[np.ndarray, "A L 9"], Bool[np.ndarray, "A L"], Float[np.ndarray, " L"], int]:
     """States of all objects (columns STATE), which of them are valid, the times (s) and the current step.
 
     A future without a valid step (hidden in WOMD's test set) is left out.
@@ -177,9 +175,7 @@ def _signals(features: Features, prefix: str) -> tuple[np.ndarray, ...]:
     """
     stamps, lanes = (features.integers(f"{prefix}{name}") for name in ("timestamp_micros", "id"))
     if not len(stamps) or len(lanes) % len(stamps):
-        raise SceneError(
-            f"{features.where}{prefix}id: expected a multiple of {len(stamps)} numbers, for each timestamp, got {len(lanes)}"
-        )
+        raise SceneError(f"{features.where}{prefix}id: expected a multiple of {len(stamps)} numbers, for each timestamp, got {len(lanes)}")
     state, valid = features.integers(f"{prefix}state", len(lanes)), features.flags(f"{prefix}valid", len(lanes))
     known = (state >= 0) & (state < len(LIGHT_STATES))
     features.require(known | ~valid, state, f"{prefix}state", f"a state of a light, 0 to {len(LIGHT_STATES) - 1}")

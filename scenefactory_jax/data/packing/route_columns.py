@@ -168,9 +168,7 @@ def _cut(routes: Sequence[SampledRoute], half: float) -> list[SampledRoute]:
     return [route for route in cut if route is not None]
 
 
-def _assemble(
-    found: Sequence[SampledRoute], owner: Sequence[int], drawn: int, slots: int, traffic: int
-) -> dict[str, np.ndarray]:
+def _assemble(found: Sequence[SampledRoute], owner: Sequence[int], drawn: int, slots: int, traffic: int) -> dict[str, np.ndarray]:
     """The columns that depend on the routes alone, the last of which are drawn, and zeros in those of agents and traffic."""
     points = max((len(route.xy) for route in found), default=0)
     position = np.zeros((len(found), points, 2))
@@ -196,9 +194,7 @@ def _assemble(
     }
 
 
-def _find_lanes(
-    found: Sequence[SampledRoute], index_of_lane: Int[np.ndarray, " N"], raw: RawScene, points: int
-) -> dict[str, np.ndarray]:
+def _find_lanes(found: Sequence[SampledRoute], index_of_lane: Int[np.ndarray, " N"], raw: RawScene, points: int) -> dict[str, np.ndarray]:
     """Lane and speed limit at every point; behind a route's end those of the end."""
     lane, limit = np.full((len(found), points), -1), np.full((len(found), points), np.inf)
     known = np.array([np.inf if (line := raw.roads[index].speed_limit) is None else line for index in index_of_lane], float)

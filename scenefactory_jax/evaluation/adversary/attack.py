@@ -116,9 +116,7 @@ def judge_worlds(result: Result, touched: Bool[np.ndarray, " W"] | None) -> list
     return [next((name for name, mask in dropped.items() if mask[world]), KEPT) for world in range(len(solved))]
 
 
-def make_table(
-    result: Result, scene: Scene, names: tuple[str, ...], verdicts: list[str], *, start_row: int
-) -> list[dict[str, Any]]:
+def make_table(result: Result, scene: Scene, names: tuple[str, ...], verdicts: list[str], *, start_row: int) -> list[dict[str, Any]]:
     """Lists a row for every world."""
     attack, contact = result.attack, result.attack.outcome.contact
     off_road, logged_off_road = (np.asarray(part) for part in _find_off_road(scene, attack, start_row=start_row))

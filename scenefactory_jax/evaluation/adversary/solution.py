@@ -24,9 +24,7 @@ class Solution(NamedTuple):
     solved: Bool[Array, ""]
 
 
-def solve_by_planner(
-    drive: DriveEgo, parameters: Any, scene: Scene, attack: Attack, key: PRNGKeyArray, *, start_row: int
-) -> Solution:
+def solve_by_planner(drive: DriveEgo, parameters: Any, scene: Scene, attack: Attack, key: PRNGKeyArray, *, start_row: int) -> Solution:
     """Drives another planner in the ego's place; solved: it touches no adversary, and others only where they come from behind.
 
     Args:

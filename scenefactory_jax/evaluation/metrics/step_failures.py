@@ -36,9 +36,7 @@ COMPLIANCE = {  # metric whose value below 1 is a failure -> what happens
 LABELS = EVENTS | COMPLIANCE
 
 
-def find_failures(
-    record: EpisodeRecord, steps: StepMetrics, metrics: Mapping[str, Value], *, dt: float
-) -> dict[str, Bool[Array, " T"]]:
+def find_failures(record: EpisodeRecord, steps: StepMetrics, metrics: Mapping[str, Value], *, dt: float) -> dict[str, Bool[Array, " T"]]:
     """Finds the counted states in which each metric of LABELS fails; none of a metric that is met in the end or has no value.
 
     A second that is uncomfortable or leads against the lanes is marked at its end. Seconds on several lanes and metres among oncoming

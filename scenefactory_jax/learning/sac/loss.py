@@ -96,8 +96,6 @@ def compute_losses(
     return critic_loss + actor_loss, metrics | found
 
 
-def compute_alpha_loss(
-    log_alpha: Float[Array, ""], entropy: Float[Array, ""], *, target: float | Float[Array, ""]
-) -> Float[Array, ""]:
+def compute_alpha_loss(log_alpha: Float[Array, ""], entropy: Float[Array, ""], *, target: float | Float[Array, ""]) -> Float[Array, ""]:
     """Computes alpha (entropy - target), which falls with alpha where the entropy is above its target."""
     return jnp.exp(log_alpha) * (entropy - target)

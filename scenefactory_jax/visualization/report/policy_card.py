@@ -38,8 +38,7 @@ def format_card(
         document.section("Training", markdown.format_table(["", ""], _training(config, versions, training))),
         document.section("Scores", *_scores(scores), "\n".join(f"- **{what}**: {text}." for what, text in described.items())),
         "## Files",
-        "`config.yaml` has every setting of the training, `checkpoints/policy.npz` the parameters. "
-        + _describe_code(outside),
+        "`config.yaml` has every setting of the training, `checkpoints/policy.npz` the parameters. " + _describe_code(outside),
     )
     return text + "\n"
 

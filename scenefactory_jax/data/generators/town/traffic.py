@@ -63,9 +63,7 @@ def _simulate(
     wrong = {} if faults is None else {"runs": faults.runs, "turns": faults.turns}
     users = users if faults is None else faults.users
     logs, motion = [], simulate(users, gates.state, times, driver, **wrong)
-    for number, (user, place, speed, present) in enumerate(
-        zip(users, motion.place.T, motion.speed.T, motion.present.T, strict=True)
-    ):
+    for number, (user, place, speed, present) in enumerate(zip(users, motion.place.T, motion.speed.T, motion.present.T, strict=True)):
         row, rows = place / STEP_M, np.arange(len(user.path.points), dtype=float)
         position, yaw = interpolate(row, rows, user.path.points), np.interp(row, rows, user.path.yaw)
         if faults is not None and faults.drift_m[number] > 0:
