@@ -7,7 +7,7 @@ from jaxtyping import Array, Bool, Float
 from scenefactory_jax.core.geometry import heading_vector, to_frame
 
 PARALLEL = 1e-6  # sine of the angle below which a ray and a segment are parallel
-SEGMENTS_AT_ONCE = 128
+SEGMENTS_AT_ONCE = 32
 
 
 def make_ray_directions(count: int) -> Float[Array, "{count} 2"]:
