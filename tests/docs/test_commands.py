@@ -46,6 +46,16 @@ SMALL = {
     "attack": ["worlds=2", "search.rounds=2", "solution.planners=[]", "contact.enable=false", "pictures=1"],
 }
 
+VMAX = ["study.base=[experiment=vmax,worlds=2]", "study.common=[iterations=1,++learner.buffer=2000]", "study.planners=[log]"]
+SMALL_STUDIES = {  # of studies whose trainings need the experiment that they name
+    "study=vmax": [*VMAX, "only=[control]", "study.trainings.control=['learner.learning_starts=100']"],
+    "study=vmax_scenes": [
+        *VMAX,
+        "only=[sac]",
+        "study.trainings.sac=['scenes.path=train.bank','stream=shuffled','stream.workers=1','learner.learning_starts=100']",
+    ],
+}
+
 pytestmark = pytest.mark.slow
 
 
@@ -97,5 +107,6 @@ def test_a_command_of_the_pages_runs(desk, line):
         words.append("experiment=smoke")
     words += FEW if "experiment=drive" in words else []
     words += SMALL.get(command, [])
+    words += next((small for name, small in SMALL_STUDIES.items() if name in words), [])
     done = shell(desk, command, *words, **QUICKLY)
     assert done.returncode == 0, f"{shlex.join([command, *words])}\n{done.stdout[-1500:]}\n{done.stderr[-2500:]}"
