@@ -49,6 +49,14 @@ def opened(found):
     return mixture.open_mixture(found["scenes"], found["stream"]["banks"], found["stream"]["shares"])
 
 
+def test_no_experiment_streams_against_a_users_word():
+    files = sorted((hydra_config.find_conf() / "experiment").glob("*.yaml"))
+    streaming = [file.stem for file in files if "stream" in file.read_text()]
+    assert "generalist" in streaming
+    for name in streaming:
+        assert hydra_config.load_config("benchmark", f"experiment={name}", "stream=none")["stream"] is None, name
+
+
 def test_entries_of_all_sources_follow_each_other(banks):
     source, parts = opened(configured(banks))
     assert source.count is None and [part.first for part in parts] == [0, 5, 8] and mixture.count_known(source, parts) == 8
