@@ -569,7 +569,7 @@ def test_what_a_user_can_mend_is_one_line(arguments, message, monkeypatch, capsy
 
 PLANNERS = tuple(f"policy={name}" for name in ("pure_pursuit", "route_pursuit", "idm_route", "pdm_closed", "expert", "constant", "random"))
 FOR_PLANNERS = ("observations=planning", "observations=log", "observations=noise")
-RATES = ("actions=rates_10hz", "actions=rates_10hz_reverse")
+RATES = ("actions=rates_10hz", "actions=rates_10hz_reverse", "actions=generalist_finetune")
 
 
 PARTS = ("base", "cloning")  # files of options that are none
@@ -693,6 +693,17 @@ def test_episodes_are_described():
     assert found["Background traffic"] == "as recorded, it does not react" and found["Longest episode"] == "50 s"
     assert found["Scenes"] == "up to 16 agents in 200 m x 200 m, centre sdc"
     assert circumstances.describe({"seed": 3}) == {}
+
+
+OTHERS = ("traffic=none", "spawning=logged", "reward=paper", "policy=actor_critic", "actions=pedals_with_reverse", "stream=none")
+
+
+@pytest.mark.parametrize("name", ["drive", "generalist_finetune", "scenarionet"])
+def test_an_experiment_takes_other_options(name):
+    """What only one option of a group has is in that option and not in the experiment, where it would stay."""
+    found = hydra_config.load_config("train", f"experiment={name}", *OTHERS)
+    builds(found)
+    assert found["stream"] is None and found["traffic"].keys() == {"_target_"}
 
 
 @pytest.mark.parametrize("name", [pytest.param(n, marks=[pytest.mark.slow] if n in ALIKE else []) for n in names("experiment")])

@@ -281,7 +281,7 @@ def test_the_whole_command(tmp_path):
     config = load_config("sysid", f"out={tmp_path}", "sysid.every=40", "sysid.refine.rounds=1", "workers=2", f"sysid.budget={budget}")
     found = sysid(config)
     written = {path.name for path in tmp_path.iterdir()}
-    figures = {f"{name}.png" for name in sysid_report.PICTURES}
+    figures = {f"{name}.png" for name in ("frequency_response", *sysid_report.PICTURES)}
     assert written == {"training.npz", "extra.npz", "heldout.npz", "stages", "result.json", "fitted.yaml", "sysid.md"} | figures
     assert all(fit["refined"]["loss"] <= fit["refined"]["start_loss"] for fit in found["fits"].values())
     assert set(found["cars"]) == {"fitted", "start", "published"} and set(found["responses"]) == {"teacher", *found["cars"]}
