@@ -38,7 +38,8 @@ def instantiate(entry: Mapping[str, Any], *, builtins: types.ModuleType | str, w
     supplied = {key: value for key, value in context.items() if key in parameters}
     tunable = [name for name in parameters if name not in supplied]
 
-    check_names(numbers, tunable, where=where, required=[name for name in tunable if parameters[name].default is inspect.Parameter.empty])
+    required = [name for name in tunable if parameters[name].default is inspect.Parameter.empty]
+    check_names(numbers, tunable, where=where, required=required, hint="; if the option in use has no such key, ~{key} takes it out")
     hints = read_hints(inspect.unwrap(function))
     values = {key: read_value(value, hints.get(key, Any), where=f"{where}.{key}") for key, value in numbers.items()}
     return functools.partial(function, **values, **supplied)

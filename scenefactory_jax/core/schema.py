@@ -94,14 +94,18 @@ def read(config: Any, schema: type[T], *, where: str = "") -> T:
         raise ConfigError(_join(where, error)) from None
 
 
-def check_names(config: Mapping[str, Any], valid: list[str], *, where: str, required: list[str]) -> None:
+def check_names(config: Mapping[str, Any], valid: list[str], *, where: str, required: list[str], hint: str = "") -> None:
     """Checks that a mapping has all required keys and no unknown ones.
+
+    Args:
+        hint: end of the message of an unknown key, `{key}` in it.
 
     Raises:
         ConfigError: naming the first missing or unknown key, and the valid ones.
     """
     if unknown := [key for key in config if key not in valid]:
-        raise ConfigError(f"{_join(where, unknown[0])}: unknown key; valid: {', '.join(sorted(valid)) or 'none'}")
+        key = _join(where, unknown[0])
+        raise ConfigError(f"{key}: unknown key; valid: {', '.join(sorted(valid)) or 'none'}{hint.format(key=key)}")
     if missing := [key for key in required if key not in config]:
         raise ConfigError(f"{_join(where, missing[0])}: missing; {where or 'the config'} needs {', '.join(sorted(valid))}")
 

@@ -49,6 +49,8 @@ def test_an_entry_that_the_chosen_option_lacks_is_told_how_to_leave():
     """`experiment=demo observations=vmax_road`: the experiment counts rows of a group that these observations do not have."""
     with pytest.raises(ConfigError, match=r"observations.road: .* got \{'count': 48\}; .* ~observations.road takes it out"):
         instantiate({"count": 48}, builtins=_module(), where="observations.road")
+    with pytest.raises(ConfigError, match=r"traffic.start_row: unknown key; .* ~traffic.start_row takes it out"):
+        instantiate({**ENTRY, "start_row": 10}, builtins=_module(), where="traffic")  # `experiment=vmax traffic=none`
 
 
 IMPORTED = ["build", "scenefactory_jax.env.rewards.build", "scenefactory_jax.env.rewards.Mapping", "event.func", ".event", ""]
