@@ -146,16 +146,19 @@ def test_a_critic_has_as_many_values_as_its_learner():
     assert not mean[..., 2].any() and log_std[2] == 0.0  # the number that is not read
 
 
-@pytest.mark.parametrize("rows", [late_fusion.FEW, late_fusion.FEW + 1])
-def test_critics_lower_to_the_kernels_of_sets_of_more_than_few_rows_on_a_gpu(rows):
+@pytest.mark.parametrize(
+    ("rows", "width", "kernel"), [(2, 64, "encode_small_sets"), (late_fusion.FEW + 1, 128, "encode_set"), (late_fusion.FEW, 128, None)]
+)
+def test_critics_lower_to_the_kernels_of_sets_on_a_gpu(rows, width, kernel):
     observation = OBSERVATION | {"road": jax.tree.map(lambda leaf: leaf[:, :, :rows], OBSERVATION["road"])}
-    encoder = encoding.make_encoder("late_fusion", rows=[32, 64])
+    encoder = encoding.make_encoder("late_fusion", rows=[32, width])
     network = heads.make_critic(encoder, 2, **HEAD)
     parameters = jax.eval_shape(network.init, jax.random.key(0), observation, ACTION)
     loss = jax.jit(jax.grad(lambda p: jnp.sum(network.apply(p, observation, ACTION))))
     with abstract_gpu():
         program = loss.trace(parameters).lower(lowering_platforms=("cuda",)).as_text()
-    assert ("encode_set_gradient" in program, "encode_set" in program) == (rows > late_fusion.FEW,) * 2
+    used = {name for name in ("encode_small_sets", "encode_set") if f'"{name}"' in program and f'"{name}_gradient"' in program}
+    assert used == ({kernel} if kernel else set())
 
 
 def with_neighbours(env):

@@ -6,8 +6,8 @@ vector joins the vector encoder, a set gets an encoder of `rows_default` widths.
 
 Rows are pooled before the last activation, which gives the same since activations increase. A pooled channel depends on one row, its
 winner, so that the gradient recomputes the winners and stores no activation of other rows: exact, in less time and memory. Sets with at
-most half as many rows as winners recompute all rows. On NVIDIA GPUs encoders of two layers run as one kernel for sets of more than FEW rows
-(`set_kernel`), which is tested against the plain JAX here.
+most half as many rows as winners recompute all rows. On NVIDIA GPUs encoders of two layers run as one kernel where it fits
+(`small_set_kernel`, `set_kernel`), which is tested against the plain JAX here.
 
 Differences from the published code, which follow the paper instead: no LayerNorm, no extra 64 to 64 layer before the heads.
 """
@@ -26,11 +26,11 @@ from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 from scenefactory_jax.core.pallas import on_gpu
 from scenefactory_jax.core.schema import ConfigError, Count
 from scenefactory_jax.core.types import Observation, Policy, SetObservation
-from scenefactory_jax.learning.networks import set_kernel, squashed
+from scenefactory_jax.learning.networks import set_kernel, small_set_kernel, squashed
 from scenefactory_jax.learning.networks.heads import ACTIVATIONS, invert_deviation, split_gaussian
 from scenefactory_jax.learning.networks.observation_blocks import check_groups
 
-FEW = 4  # rows: a kernel computes blocks of 32, of which more would be empty
+FEW = 4  # rows: `set_kernel` computes blocks of 32, of which more would be empty
 
 
 @dataclasses.dataclass(frozen=True)
@@ -248,17 +248,18 @@ def _winners(activation: str, dtype: str, kernels: bool, weights: list, x: Array
     def plain(weights: list, x: Array, mask: Array) -> tuple[Array, Array]:
         return find_winners(affine(activation, dtype, weights, x), mask)
 
-    quick = functools.partial(set_kernel.encode, activation, dtype)
-    return _on(kernels and _suits_kernel(weights, mask), quick, plain, weights, x, mask)
+    kernel = _find_kernel(weights, mask) if kernels else None
+    if kernel is None:
+        return plain(weights, x, mask)
+    return on_gpu(functools.partial(kernel.encode, activation, dtype), plain, weights, x, mask)
 
 
-def _suits_kernel(weights: list, mask: Bool[Array, "*batch K"]) -> bool:
-    """Whether the kernels take less time than plain JAX on a GPU."""
-    return mask.shape[-1] > FEW and set_kernel.fits(weights)
-
-
-def _on(kernel: bool, quick: Callable, plain: Callable, *arguments: Any) -> Any:
-    return on_gpu(quick, plain, *arguments) if kernel else plain(*arguments)
+def _find_kernel(weights: list, mask: Bool[Array, "*batch K"]) -> Any:
+    """Returns the module whose kernels can compute these sets; None: neither can."""
+    rows = mask.shape[-1]
+    if small_set_kernel.fits(weights, rows):
+        return small_set_kernel
+    return set_kernel if rows > FEW and set_kernel.fits(weights) else None
 
 
 def _encode_forward(activation: str, dtype: str, kernels: bool, weights: list, x: Array, mask: Array) -> tuple[Array, tuple]:
@@ -271,9 +272,10 @@ def _encode_backward(activation: str, dtype: str, kernels: bool, residuals: tupl
     cotangent = jnp.where(jnp.any(mask, axis=-1)[..., None], cotangent, 0.0)
     few = 2 * mask.shape[-1] <= weights[-1][0].shape[1]  # rows need no gather
     plain = functools.partial(_through_rows if few else _through_winners, activation, dtype)
-    quick = functools.partial(set_kernel.gradient, activation, dtype)
-    operands = (weights, x, winner, cotangent)
-    of_weights = _on(kernels and _suits_kernel(weights, mask), quick, lambda *operands: plain(*operands)[0], *operands)
+    kernel, operands = _find_kernel(weights, mask) if kernels else None, (weights, x, winner, cotangent)
+    if kernel is None:
+        return *plain(*operands), None
+    of_weights = on_gpu(functools.partial(kernel.gradient, activation, dtype), lambda *operands: plain(*operands)[0], *operands)
     return of_weights, plain(*operands)[1], None  # the compiler removes the gradient of the rows where it is not used
 
 

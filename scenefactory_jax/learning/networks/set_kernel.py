@@ -58,10 +58,11 @@ def encode(
     if not mask.size:
         return jnp.zeros((*batch, out), jnp.float32), jnp.zeros((*batch, out), jnp.int32)
     x, mask = x.reshape(-1, width, features), mask.reshape(-1, width)
-    operands = (pallas.block_of(mask)[:, None], x, mask.astype(jnp.int8), _with_bias(first, first_bias), second.astype(dtype), second_bias)
+    operands = (pallas.block_of(mask)[:, None], x, mask.astype(jnp.int8))
+    operands += (with_bias(first, first_bias, INPUTS), second.astype(dtype), second_bias)
     rows = ROWS if width > FEW else FEW
     pooled, winner = pl.pallas_call(
-        functools.partial(_encode, activate=_activations(interpret)[activation][0], rows=rows, width=width, features=features),
+        functools.partial(_encode, activate=activations(interpret)[activation][0], rows=rows, width=width, features=features),
         grid=(len(x),),
         in_specs=[*map(pallas.row, operands[:3]), *map(pallas.whole, operands[3:])],
         out_specs=[pl.BlockSpec((None, out), lambda i: (i, 0))] * 2,
@@ -130,9 +131,9 @@ def gradient(
     cotangent = cotangent.reshape(-1, out)
     programs = min(programs, len(cotangent))
     last = pallas.block_of((cotangent != 0.0).any(axis=1)[None])
-    activate, slope = _activations(interpret)[activation]
+    activate, slope = activations(interpret)[activation]
     rounded = second.T.astype(dtype).astype(jnp.float32)
-    operands = (last, x.reshape(-1, width, features), winner.reshape(-1, out), cotangent, _with_bias(first, first_bias), rounded)
+    operands = (last, x.reshape(-1, width, features), winner.reshape(-1, out), cotangent, with_bias(first, first_bias, INPUTS), rounded)
     outer, inner = pl.pallas_call(
         functools.partial(_gradient, activate=activate, slope=slope, dtype=jnp.dtype(dtype), features=features),
         grid=(programs, out // CHANNELS),
@@ -194,12 +195,12 @@ def _ones(rows: int, features: int) -> Array:
     return jnp.broadcast_to(jnp.where(jnp.arange(INPUTS) == features, 1.0, 0.0)[None, :], (rows, INPUTS))
 
 
-def _with_bias(kernel: Array, bias: Array) -> Array:
-    """The first layer as one matrix, for rows with a one behind their features."""
-    return jnp.concatenate([kernel, bias[None], jnp.zeros((INPUTS - 1 - len(kernel), kernel.shape[1]), kernel.dtype)])
+def with_bias(kernel: Array, bias: Array, inputs: int) -> Array:
+    """The first layer as one matrix, for rows of so many columns with a one behind their features."""
+    return jnp.concatenate([kernel, bias[None], jnp.zeros((inputs - 1 - len(kernel), kernel.shape[1]), kernel.dtype)])
 
 
-def _activations(interpret: bool) -> dict[str, tuple[Callable[[Any], Any], Callable[[Any, Any], Any]]]:
+def activations(interpret: bool) -> dict[str, tuple[Callable[[Any], Any], Callable[[Any, Any], Any]]]:
     """Name -> the function, and its slope from its input and output."""
     exp2 = jnp.exp2 if interpret else _exp2
     return {

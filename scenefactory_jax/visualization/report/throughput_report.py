@@ -48,7 +48,7 @@ def write(folder: Path, result: Mapping[str, Any]) -> Path:
         "physics is in full float32."
     )
     scaling = ""
-    if len(sizes) > 2:
+    if len({_size(row) for row in sizes}) > 2:
         picture = plots.save(figure(sizes), folder / "scaling.png")
         scaling = document.join(format_scaling(result), f"![Time and memory against worlds]({picture.name})")
     return document.write(
