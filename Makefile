@@ -5,7 +5,7 @@ BIN = $(VENV)/bin
 STAMP = $(VENV)/.installed
 CUDA ?= # make install CUDA=1 adds the CUDA build of JAX
 
-.PHONY: help install demo test test-slow test-browser check docs notebook clean
+.PHONY: help install demo test test-types test-slow test-browser check docs notebook clean
 
 help: ## this list
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed 's/:.*##/\t/' | expand -t 14
@@ -26,6 +26,9 @@ demo: $(STAMP) ## a page of a policy of the package that drives among traffic; t
 
 test: $(STAMP) ## the fast tests, a chosen set
 	$(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder
+
+test-types: $(STAMP) ## the fast tests with all annotations checked, shapes included; before a release
+	$(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder --jaxtyping-packages=scenefactory_jax,beartype.beartype
 
 test-slow: $(STAMP) ## all other tests, before a release
 	XLA_FLAGS= $(BIN)/python -m pytest -m slow --ignore tests/test_digests.py

@@ -3,7 +3,7 @@
 import gc
 from pathlib import Path
 
-from support import compiler, type_checks  # noqa: F401  # before anything imports JAX or the package
+from support import compiler  # noqa: F401  # before anything imports JAX
 
 # isort: split
 import pytest

@@ -1,7 +1,6 @@
 """Laws of towns: lanes connect, road users touch neither each other nor kerbs, and obey lights, signs and right of way."""
 
 
-import jaxtyping
 import numpy as np
 import pytest
 import shapely
@@ -40,14 +39,10 @@ def generator(**changes):
 
 @pytest.fixture(scope="module")
 def scenes():
-    """A series, two motorways, which are rare, and two roads of blocks; all but the first without checks of annotations, for speed."""
+    """A series, two motorways, which are rare, and two roads of blocks."""
     town, motorway = generator(), generator(network=NETWORK | {"motorway_fraction": 1.0})
     blocks = generator(blocks=BLOCKS, traffic=TRAFFIC | {"cars": [8, 30]})
-    first = town(8, 0)
-    jaxtyping.config.update("jaxtyping_disable", True)
-    others = [*(town(8, index) for index in range(1, COUNT)), motorway(8, COUNT), motorway(8, COUNT + 1), blocks(8, 0), blocks(8, 1)]
-    jaxtyping.config.update("jaxtyping_disable", False)
-    return [first, *others]
+    return [*(town(8, index) for index in range(COUNT)), motorway(8, COUNT), motorway(8, COUNT + 1), blocks(8, 0), blocks(8, 1)]
 
 
 def lanes_of(scene):

@@ -38,7 +38,7 @@ UNUSABLE = {
 
 @pytest.fixture
 def unchecked_annotations():
-    """The package as its users run it: in the tests every annotated function checks its arguments, and would refuse first."""
+    """The package as its users run it: where annotations are checked (`make test-types`), functions would refuse first."""
     jaxtyping.config.update("jaxtyping_disable", True)
     yield
     jaxtyping.config.update("jaxtyping_disable", False)

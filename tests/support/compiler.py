@@ -9,7 +9,7 @@ from importlib.metadata import version
 from pathlib import Path
 
 os.environ.setdefault("MPLBACKEND", "Agg")
-# Python's own compilation of the package and the tests, with the checks of annotations, is half of their collection: processes that tests
+# Python's own compilation of the package and the tests is half of their collection: processes that tests
 # start and later runs find it even where an image's environment asks for no such files.
 sys.dont_write_bytecode = False
 os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
