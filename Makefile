@@ -5,7 +5,7 @@ BIN = $(VENV)/bin
 STAMP = $(VENV)/.installed
 CUDA ?= # make install CUDA=1 adds the CUDA build of JAX
 
-.PHONY: help install demo test test-types test-slow test-browser check docs notebook clean
+.PHONY: help install demo test test-ci test-types test-slow test-browser check docs notebook clean
 
 help: ## this list
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed 's/:.*##/\t/' | expand -t 14
@@ -24,11 +24,16 @@ demo: $(STAMP) ## a page of a policy of the package that drives among traffic; t
 	$(BIN)/python -m scenefactory_jax view run=drive overrides='[traffic=idm]' out=runs/drive.html
 	$(BIN)/python -m scenefactory_jax train experiment=demo
 
-test: $(STAMP) ## the fast tests, a chosen set
-	$(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder
+TEST = $(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder
 
-test-types: $(STAMP) ## the fast tests with all annotations checked, shapes included; before a release
-	$(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder --jaxtyping-packages=scenefactory_jax,beartype.beartype
+test: $(STAMP) ## the fast tests, a chosen set
+	$(TEST)
+
+test-ci: $(STAMP) ## tests of whole runs and of programs that take long to compile, which CI runs, too
+	$(TEST) -m "ci and not slow and not gpu"
+
+test-types: $(STAMP) ## both with all annotations checked, shapes included; before a release
+	$(TEST) -m "not slow and not gpu" --jaxtyping-packages=scenefactory_jax,beartype.beartype
 
 test-slow: $(STAMP) ## all other tests, before a release
 	XLA_FLAGS= $(BIN)/python -m pytest -m slow --ignore tests/test_digests.py

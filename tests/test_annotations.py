@@ -1,10 +1,13 @@
-"""A whole training is traced with annotations checked; `make test-types` checks them in all fast tests."""
+"""A whole training is traced with annotations checked; `make test-types` checks them in all tests that CI runs."""
 
 import os
 import subprocess
 import sys
 
+import pytest
 from support.running import ROOT
+
+pytestmark = pytest.mark.ci
 
 TRAINING = ["experiment=drive", "weather=mixed", "traffic=idm", "spawning=routes"]
 

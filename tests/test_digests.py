@@ -3,6 +3,8 @@
 import pytest
 from support import digests
 
+pytestmark = pytest.mark.ci
+
 SLOW = ("environment", "training quick")  # a program each
 
 

@@ -16,7 +16,7 @@ from scenefactory_jax.core.instantiate import ConfigError
 from scenefactory_jax.core.types import SetObservation
 from scenefactory_jax.env import environment, observations
 
-pytestmark = pytest.mark.usefixtures("quickly")
+pytestmark = [pytest.mark.ci, pytest.mark.usefixtures("quickly")]
 
 
 def test_a_flat_observation_holds_every_group_where_its_layout_says():

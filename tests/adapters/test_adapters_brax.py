@@ -12,7 +12,7 @@ from support.adapting import ALONE, scenes
 from scenefactory_jax.adapters.brax import Drive, learning, wrap
 from scenefactory_jax.core.instantiate import ConfigError
 
-pytestmark = pytest.mark.usefixtures("quickly")
+pytestmark = [pytest.mark.ci, pytest.mark.usefixtures("quickly")]
 
 WORLDS = 3
 EVALS = {"num_evals": 2}  # before and after

@@ -20,7 +20,7 @@ from scenefactory_jax.adapters.gymnasium import ID, Drive, DriveVector  # noqa: 
 from scenefactory_jax.core.instantiate import ConfigError  # noqa: E402
 from scenefactory_jax.visualization.birds_eye import drawing  # noqa: E402
 
-pytestmark = pytest.mark.usefixtures("quickly")
+pytestmark = [pytest.mark.ci, pytest.mark.usefixtures("quickly")]
 
 WORLDS, STEPS = 3, 70  # an episode takes 60
 

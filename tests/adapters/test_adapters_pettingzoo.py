@@ -14,7 +14,7 @@ from pettingzoo.test import parallel_api_test, parallel_seed_test
 from scenefactory_jax.adapters.pettingzoo import Drive
 from scenefactory_jax.core.instantiate import ConfigError
 
-pytestmark = pytest.mark.usefixtures("quickly")
+pytestmark = [pytest.mark.ci, pytest.mark.usefixtures("quickly")]
 
 
 @pytest.fixture(scope="module")

@@ -18,6 +18,8 @@ from scenefactory_jax.data.loading.stream import StreamConfig
 from scenefactory_jax.learning import phase_timing
 from scenefactory_jax.visualization.report import throughput_report as report
 
+pytestmark = pytest.mark.ci
+
 ROOT = Path(__file__).resolve().parents[2]
 SMALL = ("experiment=smoke", "dynamics=bicycle", "worlds=4", "warmup=0", "repeats=1")
 SMALL += ("~observations.road", "~observations.neighbours")  # less to compile

@@ -23,6 +23,8 @@ from scenefactory_jax.evaluation.settings import ScoreSettings
 from scenefactory_jax.evaluation.statistics import Estimate
 from scenefactory_jax.visualization.report import planner_table
 
+pytestmark = pytest.mark.ci
+
 SMALL = ["scenes=streets", "scenes.heldout.count=3", "dynamics=bicycle_waymax", "timing=waymax", "actions=acceleration"]
 SMALL += ["timing.episode_s=2", "scenes.pack.traffic=8", "step_metrics.kernels=false"]
 PLANNERS = ["random"]

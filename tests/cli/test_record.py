@@ -13,7 +13,7 @@ from scenefactory_jax.core.schema import ConfigError
 from scenefactory_jax.env import environment
 from scenefactory_jax.learning import recording, sample_files, training_loop
 
-pytestmark = pytest.mark.usefixtures("quickly")
+pytestmark = [pytest.mark.ci, pytest.mark.usefixtures("quickly")]
 CHUNK, NOISE = 50, "learner.expert_noise.part=0.5"
 TASK = ("spawning=logged", "actions=one_pedal_10hz")
 SMALL = ("learner.horizon=8", "learner.buffer=120", "learner.learning_starts=8", "learner.batch=16", "evaluation.enable=false")

@@ -24,7 +24,7 @@ from scenefactory_jax.evaluation.records import read_records, select_rows
 from scenefactory_jax.learning import run_folder, training_loop
 from scenefactory_jax.visualization.report import plots, study_report
 
-pytestmark = pytest.mark.usefixtures("quickly")
+pytestmark = [pytest.mark.ci, pytest.mark.usefixtures("quickly")]
 
 STUDIES = sorted(path.stem for path in (hydra_config.find_conf() / "study").glob("*.yaml") if path.stem != "base")
 BASE = ["experiment=smoke", "worlds=2", "scenes.count=2", "scenes.heldout.count=2"]

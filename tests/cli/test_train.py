@@ -311,6 +311,7 @@ def told(report: Path):
     return hydra_config.load_config("evaluate", *shlex.split(line))
 
 
+@pytest.mark.ci
 def test_both_protocols_and_the_same_records_twice(whole, tmp_path, undrawn_figures):
     result = judged(whole, tmp_path, "video.enable=false")
     assert set(result.records) == {"strict", "goal_only"} and result.report.is_file()
@@ -350,6 +351,7 @@ def test_wrong_overrides_of_a_run_are_named(whole, tmp_path):
         evaluate(hydra_config.load_config("evaluate", f"run={tmp_path}"))
 
 
+@pytest.mark.ci
 def test_an_exported_policy_stands_for_its_run(whole, tmp_path, monkeypatch, undrawn_figures):
     """Judged alike, also by name as one of the package's own, and without a word about where scenes lay."""
     told = ["card.about='For tests.'", f"card.judged={{unseen roads: {whole.folder}}}"]
@@ -405,6 +407,7 @@ def test_a_damaged_config_is_named(tmp_path):
             evaluate(hydra_config.load_config("evaluate", f"run={tmp_path}"))
 
 
+@pytest.mark.ci
 def test_a_replay_shows_what_the_evaluation_counted(whole, tmp_path):
     page = replay(hydra_config.load_config("view", f"run={whole.folder}", "worlds=3", f"out={tmp_path / 'page.html'}")).read_text()
     head = json.loads(re.search(r'id="head">(.*?)</script>', page, re.DOTALL).group(1))

@@ -10,6 +10,8 @@ from support.running import ROOT
 
 from scenefactory_jax.core import distributed
 
+pytestmark = pytest.mark.ci
+
 
 def run(processes, end, started=None):
     """(exit code, stdout, stderr) of each process."""

@@ -20,6 +20,8 @@ from scenefactory_jax.env import environment
 from scenefactory_jax.learning import policy_io
 from scenefactory_jax.learning.training_loop import train
 
+pytestmark = pytest.mark.ci
+
 TERMS = """
     import jax.numpy as jnp
 

@@ -29,7 +29,7 @@ CALL = "python -m scenefactory_jax "
 OWN_REWARD = "import jax.numpy as jnp\n\n\ndef haste(step):\n    return jnp.log(step.metrics.speed - 100.0)\n"
 ELSEWHERE = re.compile(r"JAX_PLATFORMS=cuda")  # what a process decides when it starts
 
-pytestmark = pytest.mark.usefixtures("quickly")
+pytestmark = [pytest.mark.ci, pytest.mark.usefixtures("quickly")]
 
 
 @pytest.fixture(scope="module")

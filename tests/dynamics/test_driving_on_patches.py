@@ -18,7 +18,7 @@ from scenefactory_jax.core.types import SURFACES, Patches
 from scenefactory_jax.weather.friction import make_uniform
 from scenefactory_jax.weather.patches import read_condition
 
-pytestmark = pytest.mark.usefixtures("quickly")
+pytestmark = [pytest.mark.ci, pytest.mark.usefixtures("quickly")]
 
 G, CARS, CHUNK = 9.81, 8, 30
 LANES = 500.0 * np.arange(CARS)

@@ -16,7 +16,7 @@ from scenefactory_jax.dynamics.articulated import actuators, randomization
 from scenefactory_jax.dynamics.articulated import state as states
 from scenefactory_jax.dynamics.articulated.equations_of_motion import total_mass
 
-pytestmark = pytest.mark.usefixtures("quickly")
+pytestmark = [pytest.mark.ci, pytest.mark.usefixtures("quickly")]
 
 FREE = dataclasses.replace(  # nothing else slows it
     CAR, wheel_damping=0.0, yaw_damping=0.0, rolling_torque=0.0, air_drag=0.0, drive_torque=590.95, drive_power=1e7

@@ -28,7 +28,7 @@ from scenefactory_jax.evaluation.adversary.kinematics import Track
 from scenefactory_jax.evaluation.adversary.settings import AttackSettings
 from scenefactory_jax.visualization.mujoco import contact_replay
 
-pytestmark = pytest.mark.usefixtures("quickly")
+pytestmark = [pytest.mark.ci, pytest.mark.usefixtures("quickly")]
 
 NORTH, STEPS, DT = np.pi / 2, 60, 0.1
 SMALL = ["scenes.pack.traffic=8", "step_metrics.kernels=false", "scenes.pack.routes.alternatives=1", f"timing.episode_s={STEPS / 10:g}"]

@@ -24,6 +24,8 @@ from scenefactory_jax.evaluation.records import RecordsError, read_records, sele
 from scenefactory_jax.learning.training_loop import make_policy
 from scenefactory_jax.visualization.report import failure_pictures
 
+pytestmark = pytest.mark.ci
+
 SECONDS, DT = 8.0, 0.1
 TIME = np.arange(round(SECONDS / DT) + 20) * DT
 

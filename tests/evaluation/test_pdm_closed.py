@@ -23,7 +23,7 @@ from scenefactory_jax.evaluation.planners.pdm_simulation import SimulationConfig
 from scenefactory_jax.evaluation.planners.tracker import Tracker
 from scenefactory_jax.learning.training_loop import make_policy
 
-pytestmark = pytest.mark.usefixtures("quickly")
+pytestmark = [pytest.mark.ci, pytest.mark.usefixtures("quickly")]
 
 GO, STOP = (LIGHT_STATES.index(name) for name in ("go", "stop"))
 GREEN_S, SECONDS, HZ = 11.0, 12, 10

@@ -45,7 +45,7 @@ OPERANDS = {  # names of the official operands; `progress_ratio` and `comfort` h
     "nuplan_aggregate_score": "vmax_nuplan_score",
     "vmax_aggregate_score": "vmax_score",
 }
-pytestmark = needs_golden
+pytestmark = [pytest.mark.ci, needs_golden]
 
 
 @functools.cache

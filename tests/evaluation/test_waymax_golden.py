@@ -19,7 +19,7 @@ from scenefactory_jax.evaluation.metrics import waymax_steps
 from scenefactory_jax.roadgraph.signed_edge_distance import compute_signed_distance
 
 DISTANCE, ACTION, COMFORT, FLAGS = 5e-4, 5e-4, 6e-3, 2
-pytestmark = needs_golden
+pytestmark = [pytest.mark.ci, needs_golden]
 
 
 @functools.cache

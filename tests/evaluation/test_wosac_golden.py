@@ -19,7 +19,7 @@ FEATURE, LIKELIHOOD, FLAGS = 5e-3, 1e-5, 2
 ROLLOUTS, FUTURE = 32, 80
 OBJECTS, EDGE_POINTS, LANE_POINTS, LIGHTS = 80, 4096, 4608, 8
 SURFACE_STREET, ROAD_EDGES = (2,), (15, 16)
-pytestmark = needs_golden
+pytestmark = [pytest.mark.ci, needs_golden]
 
 
 @functools.cache

@@ -16,7 +16,7 @@ from scenefactory_jax.core import result_file
 from scenefactory_jax.core.instantiate import ConfigError
 from scenefactory_jax.dynamics.articulated import parameters as cars
 
-pytestmark = pytest.mark.usefixtures("quickly")
+pytestmark = [pytest.mark.ci, pytest.mark.usefixtures("quickly")]
 G = 9.81
 RATES = dict(physics_hz=120.0, control_hz=30.0)
 CLOCK = dict(control_hz=30.0)

@@ -114,6 +114,7 @@ def course():
     return functools.lru_cache(make_learner)
 
 
+@pytest.mark.ci
 @pytest.mark.parametrize("name", slow_except(["gail", "airl"], "gail"))
 def test_the_policy_does_as_the_expert_from_what_is_observed(course, name):
     """The environment pays for something else; no action of the expert is shown to the policy."""

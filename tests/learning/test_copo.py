@@ -130,6 +130,7 @@ def test_probes_1_to_3_values(learner):
     np.testing.assert_allclose(train_on(learner, 3, 25)[2](0.0, 1.0)[1], [[gamma] * 3, [1.0] * 3], atol=0.06)
 
 
+@pytest.mark.ci
 def test_probes_4_and_5_actions(learner):
     np.testing.assert_allclose(train_on(learner, 4, 40)[2](0.0)[0], [0.5], atol=0.1)
     _, metrics, look = train_on(learner, 5, 40)

@@ -153,6 +153,7 @@ def test_probes_1_to_3_values(course, name):
     np.testing.assert_allclose(train_on(course, name, 3, 40)[2](0.0, 1.0)[1], [[0.9, 1.0]] * 2, atol=0.06)  # alpha pays for entropy
 
 
+@pytest.mark.ci
 @pytest.mark.parametrize("name", slow_except(["sac", "td3"], "sac"))
 def test_probe_4_action(course, name):
     np.testing.assert_allclose(train_on(course, name, 4, 40)[2](0.0, 0.0)[0][:, 0], [0.5, 0.5], atol=0.12)

@@ -35,7 +35,7 @@ from scenefactory_jax.env import environment, traffic
 from scenefactory_jax.evaluation import circumstances
 from scenefactory_jax.learning import checkpoint, policy_io, policy_traffic
 
-pytestmark = pytest.mark.usefixtures("quickly")
+pytestmark = [pytest.mark.ci, pytest.mark.usefixtures("quickly")]
 PLAIN = ("dynamics=bicycle", "~reward", "+reward={}")  # of agents of which only what they see and hit counts
 
 

@@ -15,6 +15,8 @@ from support.running import ROOT
 from scenefactory_jax.core import sharding
 from scenefactory_jax.core.instantiate import ConfigError
 
+pytestmark = pytest.mark.ci
+
 # compiles in half the time; what runs here runs for a moment, and all that is compared is compiled alike
 PLAIN = "--xla_backend_optimization_level=0 --xla_llvm_disable_expensive_passes=true"
 

@@ -1,5 +1,7 @@
 """A search by the grid finds what a search through all segments finds, bit for bit."""
 
+import inspect
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -58,7 +60,7 @@ def look(count):
             **dict.fromkeys(("yaw_rate", "upright", "steer", "contact_force", "mu", "friction_utilization", "slip"), zeros),
         )  # fmt: skip
         state = type("State", (), {"motion": motion, "active": jnp.ones(agents, bool)})()
-        return observations.road.__wrapped__(scene, state, count=count, radius_m=10.0, kind_scale=20.0, kernels=True)
+        return inspect.unwrap(observations.road)(scene, state, count=count, radius_m=10.0, kind_scale=20.0, kernels=True)
 
     return jax.jit(at)
 

@@ -27,7 +27,7 @@ from scenefactory_jax.visualization.web.replay_page import ReplayError
 from scenefactory_jax.visualization.web.road_posts import find_posts
 from scenefactory_jax.visualization.web.term_styles import TermLook, term_looks
 
-pytestmark = pytest.mark.usefixtures("quickly")
+pytestmark = [pytest.mark.ci, pytest.mark.usefixtures("quickly")]
 
 
 @pytest.fixture(scope="module")

@@ -1,6 +1,7 @@
 """Patches and rain: geometry against shapely, films against their differential equation, sampling, and their use in a world."""
 
 import functools
+import inspect
 import types
 from typing import Any
 
@@ -366,10 +367,10 @@ def test_the_observation_lists_the_surfaces_of_its_config():
     state: Any = types.SimpleNamespace(weather=on(ice), motion=types.SimpleNamespace(position=position))
     observations = {"AC SMA OGFC": [[0.2, 0, 0, 0], [0, 1, 0, 0]], "ICE AC": [[0.2, 1, 0], [0, 0, 1]], "": [[0.2], [0]]}
     for surfaces, expected in observations.items():
-        observe = jax.jit(lambda: state_vectors.weather.__wrapped__(None, state, film_scale_mm=1.0, surfaces=surfaces.split()))  # noqa: B023
+        observe = jax.jit(lambda: inspect.unwrap(state_vectors.weather)(None, state, film_scale_mm=1.0, surfaces=surfaces.split()))  # noqa: B023
         np.testing.assert_allclose(observe(), expected, atol=1e-6)
     with pytest.raises(ConfigError, match=r"observations\.weather\.surfaces: expected names of AC, SMA"):
-        state_vectors.weather.__wrapped__(None, state, film_scale_mm=1.0, surfaces=["AC", "MUD"])
+        inspect.unwrap(state_vectors.weather)(None, state, film_scale_mm=1.0, surfaces=["AC", "MUD"])
 
 
 def test_an_entry_of_null_is_left_out_and_others_may_be_added():
