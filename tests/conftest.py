@@ -11,16 +11,18 @@ from support import composing
 from support.running import SHARED, quick_compilation
 
 LONGEST = (  # files that take longest, by CPU time: started first, or one worker would end with one of them alone
-    "test_train", "test_study", "test_policy_traffic", "test_sharding", "test_environment", "test_digests", "test_wosac_protocol",
-    "test_learners", "test_planner_evaluation", "test_validation_run", "test_film", "test_randomization", "test_benchmark",
-    "test_exported_world",
-    "test_adversary", "test_traffic", "test_record", "test_traffic_pool", "test_train_learners", "test_encoders", "test_adversarial",
-    "test_pretrained", "test_heads", "test_dynamics", "test_patches_and_rain", "test_collision", "test_planners", "test_scoring",
-    "test_vmax_golden", "test_wosac_golden", "test_adapters", "test_troubleshooting", "test_adapters_gymnasium",
-    "test_equations_of_motion", "test_optimization", "test_recorded_samples", "test_copo", "test_banks", "test_gpu_processes",
-    "test_contact_solver", "test_episode_metrics", "test_pdm_closed", "test_failures", "test_ppo", "test_idm_traffic", "test_extension",
-    "test_tyres", "test_unvectorised_baseline", "test_fault_isolation", "test_flags", "test_operations", "test_docs", "test_actuators",
-    "test_route_following", "test_streams", "test_inputs", "test_opendrive", "test_drive", "test_attention_kernel",
+    "test_train", "test_study", "test_digests", "test_adversary", "test_dynamics", "test_environment", "test_ppo", "test_annotations",
+    "test_planner_evaluation", "test_patches_and_rain", "test_benchmark", "test_troubleshooting", "test_docs", "test_learners",
+    "test_wosac_golden", "test_vmax_golden", "test_adversarial", "test_extension", "test_sharding", "test_adapters_gymnasium",
+    "test_validation_run", "test_copo", "test_collision", "test_adapters", "test_late_fusion", "test_idm_traffic", "test_policy_traffic",
+    "test_set_kernel", "test_checkpoint", "test_traffic", "test_failures", "test_record", "test_heads", "test_waymax_golden",
+    "test_traffic_pool", "test_route_following", "test_road_load", "test_pdm_closed", "test_friction", "test_route_observations",
+    "test_inputs", "test_vmax_observations", "test_streams", "test_gpu_processes", "test_replay_page", "test_encoders",
+    "test_multibody_model", "test_driving_on_patches", "test_friction_search", "test_episode_metrics", "test_report", "test_distributed",
+    "test_task_map", "test_rerun_file", "test_elevation", "test_town", "test_planning_rewards", "test_recorded_samples", "test_planners",
+    "test_attention_kernel", "test_readme", "test_operations", "test_road_kernels", "test_metadrive_observation",
+    "test_leader_observation", "test_flags", "test_spatial_grid", "test_reward_weights", "test_response_metrics", "test_drive",
+    "test_adapters_pettingzoo", "test_exported_world", "test_embedding_kernel", "test_grip_roads",
 )  # fmt: skip
 
 composing.share()
