@@ -150,7 +150,7 @@ def _gradient(
             parts = [pallas.product(pull, second[pl.ds(k, w), pl.ds(start, length)]) for pull, (k, w) in zip(pulls, out, strict=True)]
             steep = functools.reduce(jnp.add, parts) * slope(before, after)
             after = after.astype(second.dtype)
-            wide = [total + pallas.product(after, pull, along=0) for total, pull in zip(wide, pulls, strict=True)]
+            wide = [part + pallas.product(after, pull, along=0) for part, pull in zip(wide, pulls, strict=True)]
             results.append((wide, narrow + pallas.product(table, steep, along=0)))
         return results
 
