@@ -9,8 +9,8 @@ from importlib.metadata import version
 from pathlib import Path
 
 os.environ.setdefault("MPLBACKEND", "Agg")
-# Python's own compilation of the package and the tests is half of their collection: processes that tests
-# start and later runs find it even where an image's environment asks for no such files.
+# Python's own compilation of the package and the tests is half of their collection: processes that tests start and later runs find it even
+# where an image's environment asks for no such files.
 sys.dont_write_bytecode = False
 os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
 # Most of what the tests cost is XLA compiling programs that then run for a moment. So it compiles with less effort: LLVM at -O1 and, before

@@ -28,10 +28,10 @@ MAX_CHANNELS = 128  # more do not fit into the registers
 LOG2_E = 1.4426950408889634
 
 
-def fits(weights: Weights) -> bool:
+def fits(weights: Weights, *, inputs: int = INPUTS, channels: int = MAX_CHANNELS) -> bool:
     """Whether the kernels can compute these layers: two, of 32, 64, 96 or 128 channels, behind fewer than 16 features."""
     widths = [kernel.shape[1] for kernel, _ in weights]
-    return len(widths) == 2 and weights[0][0].shape[0] < INPUTS and all(0 < w <= MAX_CHANNELS and w % CHANNELS == 0 for w in widths)
+    return len(widths) == 2 and weights[0][0].shape[0] < inputs and all(0 < w <= channels and w % CHANNELS == 0 for w in widths)
 
 
 def encode(
@@ -77,7 +77,7 @@ def encode(
 def _encode(last, x, mask, first, second, second_bias, pooled, winner, *, activate, rows: int, width: int, features: int) -> None:
     hidden, out = tiles(first.shape[1], 64), tiles(second.shape[1], CHANNELS)
     count, lanes, columns = last[0], jnp.arange(rows), jnp.arange(INPUTS)
-    ones = _ones(rows, features)
+    ones = mark_bias(rows, features, INPUTS)
     split = (rows // 16, 2, 8)  # a thread of the matrix units holds rows r and r + 8 of 16: the larger of them needs no other thread
 
     def block(index, best):
@@ -158,7 +158,7 @@ def _gradient(last, x, winner, cotangent, first, second, outer, inner, *, activa
     parts, columns = tiles(first.shape[1], CHANNELS), jnp.arange(INPUTS)
     program, programs, base = pl.program_id(0), pl.num_programs(0), pl.program_id(1) * CHANNELS
     mine = base + jnp.arange(CHANNELS)
-    ones, known = _ones(CHANNELS, features), jnp.broadcast_to((columns < features)[None, :], (CHANNELS, INPUTS))
+    ones, known = mark_bias(CHANNELS, features, INPUTS), jnp.broadcast_to((columns < features)[None, :], (CHANNELS, INPUTS))
 
     def add(index, sums):
         at = program + index * programs  # the first sets may have rows where later ones are empty: each program gets some of both
@@ -190,9 +190,9 @@ def tiles(width: int, most: int) -> list[tuple[int, int]]:
     return results
 
 
-def _ones(rows: int, features: int) -> Array:
-    """Columns of a row beside its features: a one, for the bias."""
-    return jnp.broadcast_to(jnp.where(jnp.arange(INPUTS) == features, 1.0, 0.0)[None, :], (rows, INPUTS))
+def mark_bias(rows: int, features: int, inputs: int) -> Array:
+    """Columns of rows beside their features: a one, for the bias."""
+    return jnp.broadcast_to(jnp.where(jnp.arange(inputs) == features, 1.0, 0.0)[None, :], (rows, inputs))
 
 
 def with_bias(kernel: Array, bias: Array, inputs: int) -> Array:

@@ -25,9 +25,7 @@ MAX_CHANNELS = 96  # sums of a gradient of more do not fit into the registers
 
 def fits(weights: Weights, rows: int) -> bool:
     """Whether the kernels can compute sets of so many rows: two layers of 32, 64 or 96 channels, behind fewer than 32 features."""
-    widths = [kernel.shape[1] for kernel, _ in weights]
-    few = 0 < rows <= MAX_ROWS and weights[0][0].shape[0] < MAX_INPUTS
-    return few and len(widths) == 2 and all(0 < width <= MAX_CHANNELS and width % CHANNELS == 0 for width in widths)
+    return 0 < rows <= MAX_ROWS and set_kernel.fits(weights, inputs=MAX_INPUTS, channels=MAX_CHANNELS)
 
 
 def encode(
@@ -130,9 +128,7 @@ def gradient(
     return [(inner[:features], inner[features]), (jnp.sum(outer, axis=0), jnp.sum(cotangent, axis=0))]
 
 
-def _gradient(
-    last, x, winner, cotangent, first, second, outer, inner, *, activate, slope, size: int, width: int, total: int
-) -> None:
+def _gradient(last, x, winner, cotangent, first, second, outer, inner, *, activate, slope, size: int, width: int, total: int) -> None:
     hidden, out = tiles(first.shape[1], CHANNELS), tiles(second.shape[0], CHANNELS)
     program, programs = pl.program_id(0), pl.num_programs(0)
 
@@ -183,5 +179,5 @@ def _rows(index: Any, *, size: int, width: int, total: int) -> tuple[Array, Arra
 def _read(x: Any, at: Array, valid: Array, inputs: int) -> Array:
     """Reads rows, with a one behind their features for the bias and zeros behind it; zeros in place of those that are not valid."""
     features, columns = x.shape[1], jnp.arange(inputs)
-    ones = jnp.broadcast_to(jnp.where(columns == features, 1.0, 0.0)[None, :], (len(at), inputs))
+    ones = set_kernel.mark_bias(len(at), features, inputs)
     return plgpu.load(x.at[at[:, None], columns[None, :]], mask=valid[:, None] & (columns < features)[None, :], other=ones)
